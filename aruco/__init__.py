@@ -1,0 +1,1 @@
+"""The tools of rigcal: one algorithm a module; arrays and small frozen types in and out."""

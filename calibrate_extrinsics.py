@@ -1,0 +1,116 @@
+#!/usr/bin/env python
+"""Recordings of a marker target in, camera poses out: ask, call rigcal.pipeline, tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from aruco.model import Calibration
+    from rigcal.config import CalibrateConfig
+
+INCOMPLETE = 3  # exit code: poses were written, but not of every camera
+
+
+@click.command(context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
+@click.option("--svo", "svo", type=click.Path(path_type=Path), multiple=True,
+              help="A recording, or a folder of recordings; repeatable. Today any recording that --input reads; "
+                   "SVO files themselves cannot be read yet.")  # fmt: skip
+@click.option("-i", "--input", "inputs", type=click.Path(path_type=Path), multiple=True,
+              help="A recording: an RGB-D folder of all cameras, or of one camera; repeatable.")  # fmt: skip
+@click.option("--markers", type=click.Path(path_type=Path), required=True,
+              help="Marker map of the target (parquet).")  # fmt: skip
+@click.option("--aruco-dictionary", default="DICT_APRILTAG_36h11", show_default=True,
+              help="Any predefined OpenCV dictionary.")  # fmt: skip
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("extrinsics.json"), show_default=True,
+              help="Where the poses go.")  # fmt: skip
+@click.option("--moving-target/--resting-target", default=False, show_default=True,
+              help="Whether the target is moved between frames. If it rests, its frame is the world; if it is moved, "
+                   "the world is the target's frame at the first frame that two cameras see it in.")  # fmt: skip
+@click.option("--auto-align/--no-auto-align", default=False, show_default=True,
+              help="Turn the world upright: +Y points up, against gravity. A level camera then has "
+                   "T[:3,1] = [0,-1,0].")  # fmt: skip
+@click.option("--ground-face", metavar="NAME", help="Name of a face of the target that lies level.")
+@click.option("--ground-marker-id", metavar="ID", type=int, help="Id of a marker that lies level.")
+@click.option("--up-axis", type=click.Choice(["+y", "-y"]), default="+y", show_default=True,
+              help="Which way the aligned world's y axis points up: +y up (default), or -y, the same world turned by "
+                   "180 degrees about x, in which ZED Fusion files are written: y points down there and a camera 1.2 m "
+                   "high stands at y = -1.2.")  # fmt: skip
+@click.option("--sync-tolerance-ms", type=click.FloatRange(min=0), metavar="MS",
+              help="How far apart frames of one moment may be. Default: half the slowest camera's frame period, at "
+                   "most 100 ms.")  # fmt: skip
+@click.option("--sample-interval", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+              help="Use every Nth synchronised frame.")  # fmt: skip
+@click.option("--max-samples", type=click.IntRange(min=1), metavar="N",
+              help="Use at most N of these, spread over the recording.")  # fmt: skip
+@click.option("--min-markers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+              help="Leave out views with fewer markers.")  # fmt: skip
+@click.option("--preview/--no-preview", default=False, show_default=True,
+              help="Write annotated frames into a folder beside the output.")  # fmt: skip
+@click.option("--seed", type=int, default=0, show_default=True, help="For every random choice.")
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Threads. Default: all cores.")
+@click.option("--debug", is_flag=True, help="Say more about what happens.")
+@click.version_option(package_name="rigcal")
+def main(**given: Any) -> None:
+    """Find out where the cameras of a rig stand.
+
+    Put a box of ArUco or AprilTag markers on the floor, record it with all cameras, and give the recordings here.
+    Exit codes: 0 all cameras placed, 1 an error, 2 wrong usage, 3 written, but not for every camera.
+    """
+    if not (given["svo"] or given["inputs"]):
+        raise click.UsageError(
+            "no recording given; pass --input PATH (or --svo PATH), as often as there are recordings"
+        )
+    from rigcal import cli
+
+    with cli.telling_errors(debug=given["debug"]):
+        calibration = _run(given)
+        cli.tell(calibration, given["output"])
+        raise SystemExit(0 if calibration.is_whole else INCOMPLETE)
+
+
+def _run(given: dict[str, Any]) -> Calibration:
+    from rigcal import cli
+    from rigcal.formats import native
+    from rigcal.pipeline import calibrate_files
+
+    native.check_writable(given["output"])
+    with cli.showing_progress() as progress:
+        calibration = calibrate_files(
+            [*given["svo"], *given["inputs"]],
+            given["markers"],
+            _config(given),
+            jobs=given["jobs"],
+            progress=progress,
+            preview=cli.preview_folder(given["output"]) if given["preview"] else None,
+        )
+    native.write_extrinsics(given["output"], calibration)
+    return calibration
+
+
+def _config(given: dict[str, Any]) -> CalibrateConfig:
+    from rigcal.config import AlignConfig, CalibrateConfig, DetectConfig, FrameConfig
+
+    return CalibrateConfig(
+        frames=FrameConfig(
+            sync_tolerance_ms=given["sync_tolerance_ms"],
+            sample_interval=given["sample_interval"],
+            max_samples=given["max_samples"],
+        ),
+        detect=DetectConfig(dictionary=given["aruco_dictionary"], min_markers=given["min_markers"]),
+        align=AlignConfig(
+            enabled=given["auto_align"],
+            ground_face=given["ground_face"],
+            ground_marker_id=given["ground_marker_id"],
+            up_axis=given["up_axis"],
+        ),
+        moving_target=given["moving_target"],
+        seed=given["seed"],
+    )
+
+
+if __name__ == "__main__":
+    main()

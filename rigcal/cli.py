@@ -1,0 +1,44 @@
+"""What the commands share: exit codes, logging, progress, previews, the closing table."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+from loguru import logger
+
+from aruco.errors import RigError
+from aruco.model import Calibration
+from rigcal.report.progress import showing_progress
+from rigcal.report.terminal import console, show_calibration
+
+__all__ = ["preview_folder", "showing_progress", "tell", "telling_errors"]
+
+
+@contextmanager
+def telling_errors(*, debug: bool) -> Iterator[None]:
+    """Log to stderr; an error the user can cure becomes one sentence and exit code 1, anything else stays a bug."""
+    logger.remove()
+    style = "<level>{level: <7}</level> {message}" if not debug else "{time:HH:mm:ss.SSS} {level: <7} {name}: {message}"
+    logger.add(sys.stderr, level="DEBUG" if debug else "INFO", format=style)
+    try:
+        yield
+    except RigError as error:
+        raise click.ClickException(str(error)) from error
+    except KeyboardInterrupt:
+        raise click.ClickException("interrupted; nothing was written.") from None
+
+
+def preview_folder(output: Path) -> Path:
+    """Where annotated frames go: beside the output, named after it."""
+    return output.with_name(f"{output.stem}_preview")
+
+
+def tell(calibration: Calibration, output: Path) -> None:
+    """Print the table, and where the poses went."""
+    out = console()
+    show_calibration(out, calibration)
+    out.print(f"Wrote {len(calibration.cameras)} camera poses to {output}", markup=False)

@@ -1,0 +1,61 @@
+"""Every knob a user can turn, on one page.
+
+Algorithms never see these classes: the stories in pipeline hand them plain arguments.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from aruco.model import UpAxis
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameConfig:
+    """Which frames take part."""
+
+    sync_tolerance_ms: float | None = None  # None: half the slowest camera's frame period, at most 100 ms
+    sample_interval: int = 1  # every Nth synchronised frame
+    max_samples: int | None = None  # at most so many of these, spread over the recording
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectConfig:
+    """How markers are found."""
+
+    dictionary: str = "DICT_APRILTAG_36h11"
+    min_markers: int = 1  # a view with fewer is left out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignConfig:
+    """Whether and how the world is turned upright."""
+
+    enabled: bool = False
+    ground_face: str | None = None
+    ground_marker_id: int | None = None
+    up_axis: UpAxis = "+y"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrateConfig:
+    """Everything that changes the result of a calibration; how it is computed stands beside it in Resources."""
+
+    frames: FrameConfig = field(default_factory=FrameConfig)
+    detect: DetectConfig = field(default_factory=DetectConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
+    moving_target: bool = False
+    seed: int = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for the provenance."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Resources:
+    """What changes the time and memory of a run, never its result."""
+
+    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)

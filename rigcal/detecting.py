@@ -1,0 +1,184 @@
+"""Frames in, views out: every chosen image is read, searched for markers and solved for the target's pose.
+
+Owns      walking over a recording with several threads, counting what could not be read, hashing what was.
+Leaves    the work on one image to aruco.detector and aruco.view_pose.
+
+Only views are kept, never images, so memory does not grow with the length of a recording.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+from loguru import logger
+from numpy.typing import NDArray
+
+from aruco.detector import MarkerDetector
+from aruco.model import BadFrame, Camera, Detection, Frame, FrameCounts, Progress, Recording
+from aruco.pose_math import Array
+from aruco.svo_sync import SyncResult
+from aruco.view_pose import View, solve_view
+
+# Called with every image that was read; for previews.
+OnFrame = Callable[[Frame, Camera, Detection, View | None], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seen:
+    """What one camera's images gave."""
+
+    views: tuple[View, ...]
+    detections: Mapping[int, Detection]  # frame -> markers of the target
+    digests: tuple[str, ...]  # of every image read, in time order
+    counts: FrameCounts
+    first_bad: str = ""  # why the first unreadable frame could not be read
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """A stretch of one camera's frames."""
+
+    camera: Camera
+    frames: tuple[int, ...]  # indices of synchronised frames
+    indices: tuple[int, ...]  # into the camera's stamps
+
+
+def watch(
+    recording: Recording,
+    sync: SyncResult,
+    groups: NDArray,
+    detector: MarkerDetector,
+    geometry: Mapping[int, Array],
+    *,
+    min_markers: int,
+    jobs: int,
+    progress: Progress,
+    on_frame: OnFrame | None = None,
+) -> dict[str, Seen]:
+    """Search every chosen frame of every camera.
+
+    Args:
+        recording: The images.
+        sync: Which frames belong together; its columns name the cameras.
+        groups: (n, n_cameras) the chosen rows of ``sync.groups``.
+        detector: For the target's dictionary and ids.
+        geometry: Marker id -> (4, 3) corners [m], target frame.
+        min_markers: A view with fewer is left out.
+        jobs: Threads; the result does not depend on it.
+        progress: Is told of every image.
+        on_frame: Is called with every image that was read, from several threads.
+
+    Returns:
+        Camera -> what was seen, for every camera of the recording.
+    """
+    by_name = {camera.name: camera for camera in recording.cameras}
+    chosen = {name: [(f, int(k)) for f, k in enumerate(groups[:, c]) if k >= 0] for c, name in enumerate(sync.cameras)}
+    tasks = [task for name, pairs in chosen.items() for task in _tasks(by_name[name], pairs, jobs, len(chosen))]
+    counter = _Counter(progress, sum(len(task.frames) for task in tasks))
+
+    def run(task: _Task) -> list[tuple[int, Frame | BadFrame, Detection | None, View | None]]:
+        return list(_search(recording, task, detector, geometry, min_markers, counter, on_frame))
+
+    with _one_thread_each(jobs), ThreadPoolExecutor(max_workers=max(jobs, 1)) as pool:
+        results = list(pool.map(run, tasks))
+    found: dict[str, list] = {name: [] for name in by_name}
+    for task, result in zip(tasks, results):
+        found[task.camera.name] += result
+    return {name: _summary(name, found[name], recording, sync) for name in by_name}
+
+
+class _one_thread_each:  # noqa: N801 (a context manager reads like a verb)
+    """Keep OpenCV from using all cores in each of several threads."""
+
+    def __init__(self, jobs: int) -> None:
+        self._before = cv2.getNumThreads()
+        self._now = 1 if jobs > 1 else self._before
+
+    def __enter__(self) -> None:
+        cv2.setNumThreads(self._now)
+
+    def __exit__(self, *_: object) -> None:
+        cv2.setNumThreads(self._before)
+
+
+class _Counter:
+    """Counts finished images over threads."""
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, 0
+        self._lock = threading.Lock()
+
+    def tick(self) -> None:
+        with self._lock:
+            self._done += 1
+            self._progress.step("looking for markers", self._done, self._total)
+
+
+def _tasks(camera: Camera, pairs: Sequence[tuple[int, int]], jobs: int, n_cameras: int) -> Iterator[_Task]:
+    """One task a camera, or as many stretches as keep all threads busy when there are fewer cameras than threads."""
+    parts = max(1, -(-jobs // max(n_cameras, 1)))
+    size = max(1, -(-len(pairs) // parts))
+    for start in range(0, len(pairs), size):
+        stretch = pairs[start : start + size]
+        yield _Task(camera, tuple(f for f, _ in stretch), tuple(k for _, k in stretch))
+
+
+def _search(
+    recording: Recording,
+    task: _Task,
+    detector: MarkerDetector,
+    geometry: Mapping[int, Array],
+    min_markers: int,
+    counter: _Counter,
+    on_frame: OnFrame | None,
+) -> Iterator[tuple[int, BadFrame | Frame, Detection | None, View | None]]:
+    for index, frame in zip(task.frames, recording.frames(task.camera.name, task.indices)):
+        if isinstance(frame, BadFrame):
+            logger.debug("camera {}: frame left out: {}", task.camera.name, frame.reason)
+            yield index, frame, None, None
+        else:
+            detection = detector.detect(frame.image, task.camera)
+            enough = len(detection) >= max(min_markers, 1)
+            view = solve_view(task.camera, index, detection, geometry) if enough else None
+            if on_frame is not None:
+                on_frame(frame, task.camera, detection, view)
+            yield index, _without_image(frame), detection, view
+        counter.tick()
+
+
+def _without_image(frame: Frame) -> Frame:
+    return Frame(camera=frame.camera, stamp_ns=frame.stamp_ns, image=frame.image[:0], digest=frame.digest)
+
+
+def _summary(name: str, found: Sequence[tuple], recording: Recording, sync: SyncResult) -> Seen:
+    bad = [frame for _, frame, _, _ in found if isinstance(frame, BadFrame)]
+    detections = {index: detection for index, _, detection, _ in found if detection is not None and len(detection)}
+    counts = FrameCounts(
+        recorded=len(recording.stamps_ns(name)),
+        unpaired=sync.unpaired.get(name, 0),
+        read=len(found) - len(bad),
+        bad=len(bad),
+        with_markers=len(detections),
+    )
+    return Seen(
+        views=tuple(view for *_, view in found if view is not None),
+        detections=detections,
+        digests=tuple(frame.digest for _, frame, _, _ in found if isinstance(frame, Frame)),
+        counts=counts,
+        first_bad=bad[0].reason if bad else "",
+    )
+
+
+def digest_of(seen: Seen, camera: Camera) -> str:
+    """SHA-256 over a camera's intrinsics and the bytes of every image that was read."""
+    sha = hashlib.sha256()
+    sha.update(repr((camera.width, camera.height, camera.distortion_model)).encode())
+    sha.update(camera.K.tobytes() + camera.distortion.tobytes())
+    for digest in seen.digests:
+        sha.update(digest.encode())
+    return sha.hexdigest()

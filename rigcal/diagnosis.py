@@ -1,0 +1,123 @@
+"""What went wrong, in words a user can act on: no markers, wrong dictionary, unreadable frames, doubtful cameras.
+
+Owns      the sentences, and the looking that they need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from itertools import islice
+
+from numpy.typing import NDArray
+
+from aruco.detector import MarkerDetector, diagnose_dictionaries
+from aruco.errors import CalibrationError, InputError
+from aruco.model import Frame, Recording
+from aruco.pose_math import Array
+from aruco.reprojection import Reprojection
+from aruco.rig_estimate import Placement
+from aruco.svo_sync import SyncResult
+from rigcal.config import DetectConfig
+from rigcal.detecting import Seen
+
+# Enough to see a marker if there is one, few enough to try two dozen dictionaries on.
+FRAMES_TO_TRY = 3
+CAMERAS_TO_TRY = 4
+# Well calibrated intrinsics and a true map stay far below.
+DOUBTFUL_RMS_PX = 1.5
+MIN_USED_SHARE = 0.7
+
+
+def require_views(
+    recording: Recording, geometry: Mapping[int, Array], config: DetectConfig, seen: Mapping[str, Seen]
+) -> None:
+    """Go on only if at least one view shows the target.
+
+    Raises:
+        InputError: No image could be read.
+        CalibrationError: No image shows a marker of the map; the message names what the images do show.
+    """
+    if any(s.views for s in seen.values()):
+        return
+    if not any(s.counts.read for s in seen.values()):
+        reason = next((s.first_bad for s in seen.values() if s.first_bad), "no image")
+        raise InputError(f"No image of any camera could be read ({reason}); check the recording.")
+    images = list(_first_images(recording))
+    most = max((len(d) for s in seen.values() for d in s.detections.values()), default=0)
+    if most:
+        raise CalibrationError(
+            f"No image shows {config.min_markers} markers of the map at once, at most {most}; lower --min-markers."
+        )
+    strangers = _ids_in(images, config.dictionary)
+    if strangers:
+        raise CalibrationError(
+            f"The images show {config.dictionary} markers {_listed(strangers)}, but the marker map has only "
+            f"{_listed(geometry)}; check --markers."
+        )
+    found = diagnose_dictionaries(images, geometry)
+    if found:
+        raise CalibrationError(
+            f"No {config.dictionary} marker was found, but markers of the map were in {_listed_counts(found)} in the "
+            "first frames; pass the right one with --aruco-dictionary."
+        )
+    raise CalibrationError(
+        f"No marker of any dictionary was found in the first frames (ids of the map: {_listed(geometry)}); check that "
+        "the target is in view, sharp, and larger than about 15 pixels."
+    )
+
+
+def _first_images(recording: Recording) -> Iterator[NDArray]:
+    for camera in recording.cameras[:CAMERAS_TO_TRY]:
+        count = min(FRAMES_TO_TRY, len(recording.stamps_ns(camera.name)))
+        frames = recording.frames(camera.name, range(count))
+        yield from (frame.image for frame in islice(frames, count) if isinstance(frame, Frame))
+
+
+def _ids_in(images: list[NDArray], dictionary: str) -> list[int]:
+    detector = MarkerDetector(dictionary)
+    return sorted({int(i) for image in images for i in detector.detect(image).ids})
+
+
+def _listed(numbers: Collection[int]) -> str:
+    shown = sorted(numbers)
+    text = ", ".join(map(str, shown[:12]))
+    return text if len(shown) <= 12 else f"{text}, ... ({len(shown)} in all)"
+
+
+def _listed_counts(found: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} ({count})" for name, count in found.items())
+
+
+def cameras_without_views(recording: Recording, sync: SyncResult, seen: Mapping[str, Seen]) -> dict[str, str]:
+    """Camera -> why there is not one view of the target from it."""
+    reasons: dict[str, str] = {}
+    for camera in recording.cameras:
+        s = seen[camera.name]
+        counts = s.counts
+        if s.views:
+            continue
+        if not counts.recorded:
+            reasons[camera.name] = "has no images"
+        elif counts.bad and not counts.read:
+            reasons[camera.name] = f"none of its {counts.bad} frames can be read ({s.first_bad})"
+        elif not counts.read:
+            tolerance = sync.tolerance_ns / 1e6
+            reasons[camera.name] = f"none of its {counts.recorded} frames has a partner within {tolerance:g} ms"
+        elif not counts.with_markers:
+            reasons[camera.name] = f"never sees the target in {counts.read} frames"
+        else:
+            reasons[camera.name] = f"sees too few markers for a pose in {counts.with_markers} frames"
+    return reasons
+
+
+def warnings(placement: Placement, residuals: Reprojection, seen: Seen) -> Iterator[str]:
+    """What a user should know about one camera of the result."""
+    left_out = placement.n_views - len(placement.frames)
+    if seen.counts.bad:
+        yield f"{seen.counts.bad} unreadable frames left out ({seen.first_bad})"
+    if left_out > (1 - MIN_USED_SHARE) * placement.n_views:
+        yield f"{left_out} of {placement.n_views} views do not fit the others"
+    if len(placement.frames) == 1:
+        yield "a single view: its spread is unknown"
+    if residuals.rms_px > DOUBTFUL_RMS_PX:
+        yield f"reprojection {residuals.rms_px:.1f} px: check the intrinsics and the marker map"

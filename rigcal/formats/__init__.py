@@ -1,0 +1,1 @@
+"""Calibrations in and out: one file a format."""

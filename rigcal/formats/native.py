@@ -1,0 +1,150 @@
+"""rigcal's own extrinsics file: JSON, one entry a camera, everything about the run under ``_meta``.
+
+Owns      writing and reading the layout that docs/conventions.md describes.
+Leaves    other people's formats to their own files.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aruco.errors import InputError, OutputError
+from aruco.model import Calibration, CameraPose, UpAxis
+from aruco.pose_math import Pose, checked_pose
+
+FORMAT, VERSION = "rigcal.extrinsics", 1
+MAX_FILE_BYTES = 64 * 2**20
+UP_VECTORS: dict[UpAxis, list[int]] = {"+y": [0, 1, 0], "-y": [0, -1, 0]}
+
+
+def pose_text(T_world_cam: Pose) -> str:
+    """Sixteen numbers, row by row; each reads back as the same float64."""
+    return " ".join(repr(float(number) + 0.0) for number in T_world_cam.ravel())
+
+
+def document(calibration: Calibration) -> dict[str, Any]:
+    """The content of an extrinsics file."""
+    world = {"up": UP_VECTORS[calibration.up] if calibration.up else None, "origin": "target"}
+    meta = {"format": FORMAT, "version": VERSION, "world": world, **calibration.notes}
+    if calibration.lost:
+        meta["without_pose"] = dict(calibration.lost)
+    return {**{camera.camera: _entry(camera) for camera in calibration.cameras}, "_meta": meta}
+
+
+def _entry(camera: CameraPose) -> dict[str, Any]:
+    return {
+        "pose": pose_text(camera.T_world_cam),
+        "frames": camera.n_frames,
+        "markers": camera.n_markers,
+        "rms_px": camera.rms_px,
+        "spread_mm": 1e3 * camera.spread_m,
+        "spread_deg": math.degrees(camera.spread_rad),
+        "warnings": list(camera.warnings),
+    }
+
+
+def write_extrinsics(path: Path, calibration: Calibration) -> None:
+    """Write a calibration whole or not at all.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    write_json(path, document(calibration))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON whole or not at all; the same content gives the same bytes.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(path)
+    except OSError as error:
+        try_remove(part)
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another --output.") from error
+
+
+def try_remove(path: Path) -> None:
+    """Remove a left-over file; what cannot be removed stays."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+def check_writable(path: Path) -> None:
+    """Find out before the work, not after it, whether a file can be written.
+
+    Raises:
+        OutputError: Its folder does not exist or may not be written, or the path is a folder.
+    """
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; give --output the name of a file.")
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: the folder {path.parent} does not exist; create it or choose another --output.")
+    probe = path.with_name(path.name + ".part")
+    try:
+        probe.open("ab").close()
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another --output.") from error
+    try_remove(probe)
+
+
+def read_poses(path: Path) -> dict[str, Pose]:
+    """Camera -> T_world_cam of an extrinsics file; unknown keys are ignored.
+
+    Raises:
+        InputError: The file cannot be read or an entry has no rigid pose; the message names file and camera.
+    """
+    return {name: _pose(entry, f"{path}: camera {name}") for name, entry in _cameras(read_json(path), path).items()}
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object at the root of a JSON file.
+
+    Raises:
+        InputError: There is no such file, it is too large, or it holds something else.
+    """
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError(f"{path}: over {MAX_FILE_BYTES >> 20} MiB, which is not an extrinsics file.")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a JSON file ({error}); give an extrinsics file.") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: not an extrinsics file: its root is not an object of cameras.")
+    return content
+
+
+def _cameras(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    cameras = {name: entry for name, entry in content.items() if not name.startswith("_")}
+    if not cameras:
+        raise InputError(f"{path}: holds no camera; every key that does not start with _ is one.")
+    return cameras
+
+
+def _pose(entry: Any, where: str) -> Pose:
+    text = entry.get("pose") if isinstance(entry, dict) else None
+    if not isinstance(text, str):
+        raise InputError(f"{where} has no pose; it wants sixteen numbers, row by row.")
+    try:
+        numbers = np.array([float(word) for word in text.split()])
+        return checked_pose(numbers.reshape(4, 4), where)
+    except ValueError as error:
+        raise InputError(f"{where}: the pose is not sixteen numbers of a rigid transform ({error}).") from error

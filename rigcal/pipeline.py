@@ -1,0 +1,230 @@
+"""The stories: what happens, in which order, from recordings to poses.
+
+Owns      the order of the steps, and what to say when one of them cannot go on.
+Leaves    every step to the tools in aruco and the rooms of rigcal.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aruco import alignment, moved_target, resting_target
+from aruco.detector import MarkerDetector
+from aruco.errors import CalibrationError, InputError
+from aruco.marker_geometry import Face, load_faces
+from aruco.model import SILENT, Calibration, CameraPose, Progress, Recording
+from aruco.pose_math import Array
+from aruco.reprojection import Reprojection, reproject
+from aruco.rig_estimate import Placement, RigEstimate
+from aruco.svo_sync import SyncResult, sample, synchronise
+from aruco.view_pose import View
+from rigcal import diagnosis
+from rigcal.config import AlignConfig, CalibrateConfig, FrameConfig, Resources
+from rigcal.detecting import OnFrame, Seen, digest_of, watch
+from rigcal.preview_writer import PreviewWriter
+from rigcal.sources import open_recordings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Target:
+    """What stands in the room: the faces of a marker map, and the hash of the file they came from."""
+
+    faces: Sequence[Face]
+    digest: str = ""
+
+    @property
+    def geometry(self) -> dict[int, Array]:
+        """Marker id -> (4, 3) corners [m]."""
+        return {marker: corners for face in self.faces for marker, corners in zip(face.ids, face.corners)}
+
+
+def calibrate(
+    recording: Recording,
+    target: Target,
+    config: CalibrateConfig,
+    *,
+    resources: Resources | None = None,
+    progress: Progress = SILENT,
+    on_frame: OnFrame | None = None,
+) -> Calibration:
+    """Every camera's pose in the target's world.
+
+    Args:
+        recording: Synchronised or to be synchronised images of one or more cameras.
+        target: The marker target in them.
+        config: What changes the result.
+        resources: What changes only time and memory.
+        progress: Is told how far the long steps have come.
+        on_frame: Is called with every image that was read, from several threads.
+
+    Raises:
+        InputError: The recording or an option cannot be used.
+        CalibrationError: No camera could be placed, or up is ambiguous.
+    """
+    jobs = (resources or Resources()).jobs
+    sync, groups = choose_frames(recording, config.frames)
+    detector = MarkerDetector(config.detect.dictionary, target.geometry)
+    seen = watch(
+        recording,
+        sync,
+        groups,
+        detector,
+        target.geometry,
+        min_markers=config.detect.min_markers,
+        jobs=jobs,
+        progress=progress,
+        on_frame=on_frame,
+    )
+    diagnosis.require_views(recording, target.geometry, config.detect, seen)
+    rig = place_cameras(seen, moving=config.moving_target)
+    rig, aligned, up = align(rig, target.faces, config.align)
+    residuals = reproject({c.name: c for c in recording.cameras}, rig, _used_detections(rig, seen), target.geometry)
+    return Calibration(
+        cameras=tuple(_camera_pose(name, rig.cameras[name], residuals[name], seen[name]) for name in rig.cameras),
+        lost={**diagnosis.cameras_without_views(recording, sync, seen), **rig.lost},
+        up=up,
+        frames={name: s.counts for name, s in seen.items()},
+        notes={**aligned, **_notes(recording, target, config, sync, groups, seen)},
+    )
+
+
+def calibrate_files(
+    paths: Sequence[Path],
+    markers: Path,
+    config: CalibrateConfig,
+    *,
+    jobs: int | None = None,
+    progress: Progress = SILENT,
+    preview: Path | None = None,
+) -> Calibration:
+    """The same, from files: recordings, a marker map, and a folder for previews if they are wished."""
+    target = Target(faces=load_faces(markers), digest=hashlib.sha256(markers.read_bytes()).hexdigest())
+    MarkerDetector(config.detect.dictionary)  # a wrong name is told before the recordings are searched
+    alignment.specified_face(target.faces, config.align.ground_face, config.align.ground_marker_id)
+    recording = open_recordings(paths)
+    on_frame = None if preview is None else PreviewWriter(preview, target.geometry)
+    resources = Resources() if jobs is None else Resources(jobs=jobs)
+    return calibrate(recording, target, config, resources=resources, progress=progress, on_frame=on_frame)
+
+
+def choose_frames(recording: Recording, config: FrameConfig) -> tuple[SyncResult, NDArray[np.int64]]:
+    """Which frames belong together, and which of these take part: (n, n_cameras) indices, -1 for none.
+
+    Raises:
+        InputError: Cameras have frames, but none of them at the same moment.
+    """
+    stamps = {camera.name: recording.stamps_ns(camera.name) for camera in recording.cameras}
+    tolerance = None if config.sync_tolerance_ms is None else round(1e6 * config.sync_tolerance_ms)
+    sync = synchronise(stamps, tolerance_ns=tolerance)
+    if not len(sync.groups):
+        closest = "" if sync.closest_ns is None else f" (closest: {sync.closest_ns / 1e6:.1f} ms apart)"
+        raise InputError(
+            f"No two cameras have frames within {sync.tolerance_ns / 1e6:g} ms of each other{closest}: check that the "
+            "recordings were made together and on one clock, or raise --sync-tolerance-ms."
+        )
+    return sync, sample(sync.groups, config.sample_interval, config.max_samples)
+
+
+def place_cameras(seen: Mapping[str, Seen], *, moving: bool) -> RigEstimate:
+    """The rig, from the views of a target that rests or is moved.
+
+    Raises:
+        CalibrationError: No camera could be placed, or a target that should rest was moved.
+    """
+    views = [view for s in seen.values() for view in s.views]
+    scale2 = {name: _variance_factor(s.views) for name, s in seen.items() if s.views}
+    rig = (moved_target if moving else resting_target).place_cameras(views, scale2)
+    if not moving and rig.cameras and not resting_target.rests(rig):
+        raise CalibrationError(
+            "The views do not agree on where the target rests: if it was moved between frames, pass --moving-target; "
+            "otherwise cut the recording to the part in which it rests."
+        )
+    if not rig.cameras:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in rig.lost.items())
+        raise CalibrationError(f"No camera could be placed. {reasons}.")
+    return rig
+
+
+def _variance_factor(views: Sequence[View]) -> float:
+    """How many times larger than promised the variance of a camera's corners is, by the views' own residuals."""
+    ratios = [view.best.chi2 / view.dof for view in views]
+    # The median of chi2 over its degrees of freedom is 0.7 for one marker and tends to 1 for many.
+    return max(1.0, float(np.median(ratios)) / 0.7)
+
+
+def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig) -> tuple[RigEstimate, dict[str, Any], Any]:
+    """The rig in an upright world, what to note about it, and the up axis; unchanged unless asked for."""
+    if not config.enabled:
+        return rig, {}, None
+    T_target_cam = {name: placement.T_world_cam for name, placement in rig.cameras.items()}
+    decision = alignment.find_up(
+        T_target_cam, faces, ground_face=config.ground_face, ground_marker_id=config.ground_marker_id
+    )
+    aligned = alignment.align_world(T_target_cam, decision, up_axis=config.up_axis)
+    note = {
+        "ground_face": decision.ground_face,
+        "up_in_target": [float(x) for x in decision.up_target],
+        "margin": decision.margin,
+        "camera_up": {name: [float(-x) for x in T[:3, 1]] for name, T in aligned.T_world_cam.items()},
+    }
+    return rig.turned(aligned.R_align), {"aligned": note}, config.up_axis
+
+
+def _used_detections(rig: RigEstimate, seen: Mapping[str, Seen]) -> dict[str, dict[int, Any]]:
+    return {name: {f: seen[name].detections[f] for f in p.frames} for name, p in rig.cameras.items()}
+
+
+def _camera_pose(name: str, placement: Placement, residuals: Reprojection, seen: Seen) -> CameraPose:
+    return CameraPose(
+        camera=name,
+        T_world_cam=placement.T_world_cam,
+        n_frames=len(placement.frames),
+        n_markers=len({i for f in placement.frames for i in seen.detections[f].ids.tolist()}),
+        rms_px=residuals.rms_px,
+        spread_m=placement.spread_m,
+        spread_rad=placement.spread_rad,
+        warnings=tuple(diagnosis.warnings(placement, residuals, seen)),
+    )
+
+
+def _notes(
+    recording: Recording,
+    target: Target,
+    config: CalibrateConfig,
+    sync: SyncResult,
+    groups: NDArray[np.int64],
+    seen: Mapping[str, Seen],
+) -> dict[str, Any]:
+    from rigcal import __version__
+
+    frames = {
+        name: {
+            "recorded": s.counts.recorded,
+            "unpaired": s.counts.unpaired,
+            "read": s.counts.read,
+            "unreadable": s.counts.bad,
+            "with_markers": s.counts.with_markers,
+        }
+        for name, s in seen.items()
+    }
+    clock = {
+        "tolerance_ms": sync.tolerance_ns / 1e6,
+        "groups": len(sync.groups),
+        "used": len(groups),
+        "median_skew_ms": sync.median_span_ns / 1e6,
+        "worst_skew_ms": sync.worst_span_ns / 1e6,
+    }
+    inputs = {camera.name: digest_of(seen[camera.name], camera) for camera in recording.cameras}
+    provenance = {
+        "rigcal": __version__,
+        "options": config.as_dict(),
+        "inputs_sha256": {"marker_map": target.digest, "cameras": inputs},
+    }
+    return {"frames": frames, "sync": clock, "provenance": provenance}

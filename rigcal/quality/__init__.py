@@ -1,0 +1,1 @@
+"""Metrics, and the gates that turn them into a verdict."""

@@ -1,0 +1,96 @@
+"""The end of a run in a terminal: a table of cameras, and what to know about them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from aruco.model import Calibration
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def console(*, stderr: bool = False) -> Console:
+    """A terminal to print to; plain and wide enough for tables where there is none."""
+    from rich.console import Console
+
+    made = Console(stderr=stderr, highlight=False, soft_wrap=True)
+    return made if made.is_terminal else Console(stderr=stderr, highlight=False, soft_wrap=True, width=120)
+
+
+def show_calibration(out: Console, calibration: Calibration) -> None:
+    """Per camera: frames, markers, residuals, spread; then warnings, cameras without a pose, and the world."""
+    from rich.table import Table
+
+    table = Table(title="Cameras", title_justify="left")
+    table.add_column("camera")
+    for name in ("frames", "markers", "reprojection\nRMS px", "spread\nmm", "spread\ndegrees", "x m", "y m", "z m"):
+        table.add_column(name, justify="right")
+    for camera in calibration.cameras:
+        x, y, z = camera.T_world_cam[:3, 3]
+        alone = camera.n_frames < 2
+        table.add_row(
+            camera.camera,
+            str(camera.n_frames),
+            str(camera.n_markers),
+            f"{camera.rms_px:.3f}",
+            "-" if alone else f"{1e3 * camera.spread_m:.2f}",
+            "-" if alone else f"{math.degrees(camera.spread_rad):.3f}",
+            *(f"{value:.3f}" for value in (x, y, z)),
+        )
+    out.print(table)
+    for camera in calibration.cameras:
+        for warning in camera.warnings:
+            out.print(f"warning: camera {camera.camera}: {warning}", markup=False)
+    for name, reason in calibration.lost.items():
+        out.print(f"no pose: camera {name}: {reason}", markup=False)
+    _show_clock(out, calibration)
+    out.print(_world(calibration), markup=False)
+
+
+def _show_clock(out: Console, calibration: Calibration) -> None:
+    clock = calibration.notes.get("sync")
+    if not clock or len(calibration.frames) < 2:
+        return
+    unpaired = {name: counts.unpaired for name, counts in calibration.frames.items() if counts.unpaired}
+    without = ", ".join(f"{name} {count}" for name, count in unpaired.items()) or "none"
+    out.print(
+        f"{clock['used']} of {clock['groups']} synchronised frames used; skew {clock['median_skew_ms']:.1f} ms, "
+        f"at most {clock['worst_skew_ms']:.1f} ms; frames without a partner: {without}",
+        markup=False,
+    )
+
+
+def _world(calibration: Calibration) -> str:
+    if calibration.up is None:
+        return "World: the target's frame; which way is up is not known (--auto-align turns it upright)."
+    way = "up, against gravity" if calibration.up == "+y" else "down, along gravity (ZED Fusion's frame)"
+    face = calibration.notes.get("aligned", {}).get("ground_face", "?")
+    return f"World: origin in the target, y points {way}; level face: {face}."
+
+
+def show_errors(
+    out: Console, calibration: Calibration, pair_errors: Mapping[tuple[str, str], tuple[float, float]], tilt_rad: float
+) -> None:
+    """A calibration against the truth: the errors of camera pairs beside the spread that was estimated.
+
+    Args:
+        out: Where to print.
+        calibration: What was estimated.
+        pair_errors: (camera, camera) -> error of their relative pose [rad], [m].
+        tilt_rad: Angle between the estimated and the true up.
+    """
+    from rich.table import Table
+
+    spread = {camera.camera: camera.spread_m for camera in calibration.cameras}
+    table = Table(title="Relative poses of camera pairs against the truth", title_justify="left")
+    table.add_column("pair")
+    for name in ("error\nmm", "error\ndegrees", "spread of single\nframes mm"):
+        table.add_column(name, justify="right")
+    for (i, j), (angle, distance) in pair_errors.items():
+        both = math.hypot(spread[i], spread[j])
+        table.add_row(f"{i} - {j}", f"{1e3 * distance:.2f}", f"{math.degrees(angle):.4f}", f"{1e3 * both:.2f}")
+    out.print(table)
+    out.print(f"Up differs from gravity by {math.degrees(tilt_rad):.4f} degrees.", markup=False)
