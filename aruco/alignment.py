@@ -283,8 +283,12 @@ def find_up(
         axes = face_axes([named])
         if not axes:
             raise InputError(f"The markers of face {named.name} do not lie in one plane; name another ground face.")
-    candidates = _ranked_candidates(T_target_cam, axes, lowest_of=faces)
+    candidates = rank_candidates(T_target_cam, axes, lowest_of=faces)
     decision = UpDecision(candidates=candidates)
+    for candidate in candidates:
+        logger.debug(
+            "up candidate {} {}: score {:.2f}", candidate.ground_face, _shown(candidate.up_target), candidate.score
+        )
     logger.info("up direction: margin {:.1f} over the second best (at least {:g})", decision.margin, MIN_MARGIN)
     if decision.margin < MIN_MARGIN:
         raise CalibrationError(_ambiguity_message(decision, list(T_target_cam), faces, named))
@@ -311,9 +315,10 @@ def _known(faces: Sequence[Face]) -> str:
     return ", ".join(face.name for face in faces)
 
 
-def _ranked_candidates(
+def rank_candidates(
     T_target_cam: Mapping[str, Pose], axes: Sequence[FaceAxis], *, lowest_of: Sequence[Face]
 ) -> tuple[UpCandidate, ...]:
+    """Both directions of every axis, the one that best explains the cameras as upright first."""
     poses = np.array(list(T_target_cam.values()))
     corners = np.concatenate([face.corners.reshape(-1, 3) for face in lowest_of])
     candidates = []
@@ -323,7 +328,6 @@ def _ranked_candidates(
             lowest = float((corners @ up).min())
             likelihoods = upright_log_likelihoods(poses, up, lowest)
             candidates.append(UpCandidate(up_target=up, ground_face=name, log_likelihoods=likelihoods))
-            logger.debug("up candidate {} {}: score {:.2f}", name, _shown(up), candidates[-1].score)
     return tuple(sorted(candidates, key=lambda candidate: -candidate.score))
 
 

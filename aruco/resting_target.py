@@ -10,9 +10,11 @@ better by chance, but only the true pose explains all of them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from aruco.errors import CalibrationError
 from aruco.pose_averaging import PoseAverage, average_poses
 from aruco.pose_math import Array, Pose, adjoint, invert_transform, pose_distance
 from aruco.rig_estimate import Placement, RigEstimate
@@ -23,6 +25,8 @@ SAME_HYPOTHESIS_RAD = np.radians(6.0)
 SAME_HYPOTHESIS_SHARE = 0.06  # of the distance
 # A view that a hypothesis does not explain at all costs this much, in the corners' variance.
 UNEXPLAINED_CHI2 = 4 * RULED_OUT_CHI2
+# A resting target has two or four; a moved one as many as frames, which need not all be counted to be refused.
+MAX_HYPOTHESES = 20
 # When fewer views than this agree on where the target is, it did not rest.
 MIN_AGREEING_SHARE = 0.5
 
@@ -36,30 +40,55 @@ def place_cameras(views: Sequence[View], scale2: Mapping[str, float]) -> RigEsti
 
     Returns:
         The cameras that could be placed, and why the others could not.
+
+    Raises:
+        CalibrationError: Most views disagree on where the target is: it did not rest.
     """
+    by_camera = {name: [v for v in views if v.camera == name] for name in sorted({v.camera for v in views})}
+    hypotheses = {name: _ranked(mine, scale2[name]) for name, mine in by_camera.items()}
+    _require_rest(by_camera, hypotheses)
     cameras: dict[str, Placement] = {}
     lost: dict[str, str] = {}
-    for camera in sorted({view.camera for view in views}):
-        result = _place([view for view in views if view.camera == camera], scale2[camera])
-        if isinstance(result, str):
-            lost[camera] = result
+    for name, mine in by_camera.items():
+        best, *rivals = hypotheses[name]
+        if rivals and rivals[0].cost - best.cost < RULED_OUT_CHI2:
+            lost[name] = (
+                f"{len(mine)} views leave two poses possible (a marker seen nearly face on): turn the target so that "
+                "this camera sees two faces, or record more frames"
+            )
         else:
-            cameras[camera] = result
+            cameras[name] = _placement(mine, best.T_cam_target, scale2[name])
     frames = sorted({frame for placement in cameras.values() for frame in placement.frames})
     return RigEstimate(cameras=cameras, lost=lost, T_world_target={frame: np.eye(4) for frame in frames})
 
 
-def _place(views: Sequence[View], scale2: float) -> Placement | str:
-    """One camera's placement, or why there is none."""
-    hypotheses = _hypotheses(views)
-    cost = [sum(_cost(view, T, scale2) for view in views) for T in hypotheses]
-    order = np.argsort(cost, kind="stable")
-    if len(order) > 1 and cost[order[1]] - cost[order[0]] < RULED_OUT_CHI2:
-        return (
-            f"{len(views)} views leave two poses possible (a marker seen nearly face on): turn the target so that this "
-            "camera sees two faces, or record more frames"
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hypothesis:
+    """A pose of the target that some view proposes, and what all views of the camera think of it."""
+
+    T_cam_target: Pose
+    cost: float  # in variances of the corners
+    n_explained: int  # views with a solution there
+
+
+def _ranked(views: Sequence[View], scale2: float) -> list[_Hypothesis]:
+    ranked = [
+        _Hypothesis(T, sum(_cost(v, T, scale2) for v in views), sum(_explaining(v, T) is not None for v in views))
+        for T in _hypotheses(views)
+    ]
+    return sorted(ranked, key=lambda h: h.cost)
+
+
+def _require_rest(by_camera: Mapping[str, Sequence[View]], hypotheses: Mapping[str, Sequence[_Hypothesis]]) -> None:
+    agreeing = sum(ranked[0].n_explained for ranked in hypotheses.values())
+    if agreeing < MIN_AGREEING_SHARE * sum(map(len, by_camera.values())):
+        raise CalibrationError(
+            "The views do not agree on where the target rests: if it was moved between frames, pass --moving-target; "
+            "otherwise cut the recording to the part in which it rests."
         )
-    T_cam_target = hypotheses[order[0]]
+
+
+def _placement(views: Sequence[View], T_cam_target: Pose, scale2: float) -> Placement:
     explained = [(view, c) for view in views if (c := _explaining(view, T_cam_target)) is not None]
     average = _average([c for _, c in explained])
     used = [view for (view, _), keep in zip(explained, average.inliers) if keep]
@@ -74,10 +103,10 @@ def _place(views: Sequence[View], scale2: float) -> Placement | str:
 
 
 def _hypotheses(views: Sequence[View]) -> list[Pose]:
-    """Distinct poses that some view proposes; the better ones first."""
+    """Distinct poses that some view proposes, the better ones first."""
     kept: list[Pose] = []
     for candidate in sorted((c for view in views for c in view.candidates), key=lambda c: c.chi2):
-        if not any(_same(candidate.T_cam_target, T) for T in kept):
+        if len(kept) < MAX_HYPOTHESES and not any(_same(candidate.T_cam_target, T) for T in kept):
             kept.append(candidate.T_cam_target)
     return kept
 
@@ -108,10 +137,3 @@ def information_of_inverse(candidate: Candidate) -> Array:
     """The (6, 6) information of ``T_target_cam``: a left twist x of it is ``-Ad(T_cam_target) x`` of its inverse."""
     A = adjoint(candidate.T_cam_target)
     return A.T @ candidate.information @ A
-
-
-def rests(estimate: RigEstimate) -> bool:
-    """Whether the views agree that the target stayed where it was."""
-    placements = estimate.cameras.values()
-    agreeing = sum(len(p.frames) for p in placements)
-    return agreeing >= MIN_AGREEING_SHARE * sum(p.n_views for p in placements)

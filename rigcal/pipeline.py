@@ -20,6 +20,7 @@ from aruco.detector import MarkerDetector
 from aruco.errors import CalibrationError, InputError
 from aruco.marker_geometry import Face, load_faces
 from aruco.model import SILENT, Calibration, CameraPose, Progress, Recording
+from aruco.moved_alignment import find_up_moved
 from aruco.pose_math import Array
 from aruco.reprojection import Reprojection, reproject
 from aruco.rig_estimate import Placement, RigEstimate
@@ -84,7 +85,7 @@ def calibrate(
     )
     diagnosis.require_views(recording, target.geometry, config.detect, seen)
     rig = place_cameras(seen, moving=config.moving_target)
-    rig, aligned, up = align(rig, target.faces, config.align)
+    rig, aligned, up = align(rig, target.faces, config.align, moving=config.moving_target)
     residuals = reproject({c.name: c for c in recording.cameras}, rig, _used_detections(rig, seen), target.geometry)
     return Calibration(
         cameras=tuple(_camera_pose(name, rig.cameras[name], residuals[name], seen[name]) for name in rig.cameras),
@@ -141,11 +142,6 @@ def place_cameras(seen: Mapping[str, Seen], *, moving: bool) -> RigEstimate:
     views = [view for s in seen.values() for view in s.views]
     scale2 = {name: _variance_factor(s.views) for name, s in seen.items() if s.views}
     rig = (moved_target if moving else resting_target).place_cameras(views, scale2)
-    if not moving and rig.cameras and not resting_target.rests(rig):
-        raise CalibrationError(
-            "The views do not agree on where the target rests: if it was moved between frames, pass --moving-target; "
-            "otherwise cut the recording to the part in which it rests."
-        )
     if not rig.cameras:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in rig.lost.items())
         raise CalibrationError(f"No camera could be placed. {reasons}.")
@@ -159,15 +155,19 @@ def _variance_factor(views: Sequence[View]) -> float:
     return max(1.0, float(np.median(ratios)) / 0.7)
 
 
-def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig) -> tuple[RigEstimate, dict[str, Any], Any]:
+def align(
+    rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, moving: bool
+) -> tuple[RigEstimate, dict[str, Any], Any]:
     """The rig in an upright world, what to note about it, and the up axis; unchanged unless asked for."""
     if not config.enabled:
         return rig, {}, None
-    T_target_cam = {name: placement.T_world_cam for name, placement in rig.cameras.items()}
-    decision = alignment.find_up(
-        T_target_cam, faces, ground_face=config.ground_face, ground_marker_id=config.ground_marker_id
-    )
-    aligned = alignment.align_world(T_target_cam, decision, up_axis=config.up_axis)
+    T_world_cam = {name: placement.T_world_cam for name, placement in rig.cameras.items()}
+    wish = {"ground_face": config.ground_face, "ground_marker_id": config.ground_marker_id}
+    if moving:
+        decision = find_up_moved(T_world_cam, rig.T_world_target, faces, **wish)
+    else:
+        decision = alignment.find_up(T_world_cam, faces, **wish)
+    aligned = alignment.align_world(T_world_cam, decision, up_axis=config.up_axis)
     note = {
         "ground_face": decision.ground_face,
         "up_in_target": [float(x) for x in decision.up_target],
