@@ -48,6 +48,17 @@ class _Task:
     indices: tuple[int, ...]  # into the camera's stamps
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Outcome:
+    """What is kept of one image: never its pixels."""
+
+    frame: int
+    digest: str = ""
+    bad: str = ""  # why it could not be read
+    detection: Detection | None = None
+    view: View | None = None
+
+
 def watch(
     recording: Recording,
     sync: SyncResult,
@@ -81,12 +92,12 @@ def watch(
     tasks = [task for name, pairs in chosen.items() for task in _tasks(by_name[name], pairs, jobs, len(chosen))]
     counter = _Counter(progress, sum(len(task.frames) for task in tasks))
 
-    def run(task: _Task) -> list[tuple[int, Frame | BadFrame, Detection | None, View | None]]:
+    def run(task: _Task) -> list[_Outcome]:
         return list(_search(recording, task, detector, geometry, min_markers, counter, on_frame))
 
     with _one_thread_each(jobs), ThreadPoolExecutor(max_workers=max(jobs, 1)) as pool:
         results = list(pool.map(run, tasks))
-    found: dict[str, list] = {name: [] for name in by_name}
+    found: dict[str, list[_Outcome]] = {name: [] for name in by_name}
     for task, result in zip(tasks, results):
         found[task.camera.name] += result
     return {name: _summary(name, found[name], recording, sync) for name in by_name}
@@ -136,28 +147,24 @@ def _search(
     min_markers: int,
     counter: _Counter,
     on_frame: OnFrame | None,
-) -> Iterator[tuple[int, BadFrame | Frame, Detection | None, View | None]]:
+) -> Iterator[_Outcome]:
     for index, frame in zip(task.frames, recording.frames(task.camera.name, task.indices)):
         if isinstance(frame, BadFrame):
             logger.debug("camera {}: frame left out: {}", task.camera.name, frame.reason)
-            yield index, frame, None, None
+            yield _Outcome(frame=index, bad=frame.reason)
         else:
             detection = detector.detect(frame.image, task.camera)
             enough = len(detection) >= max(min_markers, 1)
             view = solve_view(task.camera, index, detection, geometry) if enough else None
             if on_frame is not None:
                 on_frame(frame, task.camera, detection, view)
-            yield index, _without_image(frame), detection, view
+            yield _Outcome(frame=index, digest=frame.digest, detection=detection, view=view)
         counter.tick()
 
 
-def _without_image(frame: Frame) -> Frame:
-    return Frame(camera=frame.camera, stamp_ns=frame.stamp_ns, image=frame.image[:0], digest=frame.digest)
-
-
-def _summary(name: str, found: Sequence[tuple], recording: Recording, sync: SyncResult) -> Seen:
-    bad = [frame for _, frame, _, _ in found if isinstance(frame, BadFrame)]
-    detections = {index: detection for index, _, detection, _ in found if detection is not None and len(detection)}
+def _summary(name: str, found: Sequence[_Outcome], recording: Recording, sync: SyncResult) -> Seen:
+    bad = [outcome.bad for outcome in found if outcome.bad]
+    detections = {o.frame: o.detection for o in found if o.detection is not None and len(o.detection)}
     counts = FrameCounts(
         recorded=len(recording.stamps_ns(name)),
         unpaired=sync.unpaired.get(name, 0),
@@ -166,11 +173,11 @@ def _summary(name: str, found: Sequence[tuple], recording: Recording, sync: Sync
         with_markers=len(detections),
     )
     return Seen(
-        views=tuple(view for *_, view in found if view is not None),
+        views=tuple(outcome.view for outcome in found if outcome.view is not None),
         detections=detections,
-        digests=tuple(frame.digest for _, frame, _, _ in found if isinstance(frame, Frame)),
+        digests=tuple(outcome.digest for outcome in found if not outcome.bad),
         counts=counts,
-        first_bad=bad[0].reason if bad else "",
+        first_bad=bad[0] if bad else "",
     )
 
 

@@ -19,6 +19,7 @@ from aruco.marker_geometry import SHIPPED_MAPS, load_faces
 from calibrate_extrinsics import main
 from rigcal.formats.native import read_poses
 from rigcal.quality.truth import pair_errors, tilt_error
+from rigcal.sim import Simulation
 
 BOX = SHIPPED_MAPS / "standard_box_markers.parquet"
 
@@ -53,7 +54,7 @@ def assert_one_sentence(result: Result, *words: str, code: int = 1) -> None:
         assert word in errors[0], f"{word!r} not in {errors[0]!r}"
 
 
-def test_poses_agree_with_the_truth_and_up_is_up(demo, demo_folder: Path, tmp_path: Path) -> None:
+def test_poses_agree_with_the_truth_and_up_is_up(demo: Simulation, demo_folder: Path, tmp_path: Path) -> None:
     result = calibrate(demo_folder, tmp_path / "out.json", "--auto-align")
     assert result.exit_code == 0, result.output
     poses = read_poses(tmp_path / "out.json")
@@ -75,7 +76,7 @@ def test_same_input_same_bytes_whatever_the_jobs(demo_folder: Path, tmp_path: Pa
     assert str(tmp_path) not in (tmp_path / "a.json").read_text()
 
 
-def test_alignment_off_leaves_the_targets_frame(demo, demo_folder: Path, tmp_path: Path) -> None:
+def test_alignment_off_leaves_the_targets_frame(demo: Simulation, demo_folder: Path, tmp_path: Path) -> None:
     calibrate(demo_folder, tmp_path / "out.json")
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["_meta"]["world"] == {"up": None, "origin": "target"}
@@ -238,7 +239,13 @@ def strange_ids(rows: list[dict]) -> None:
         (strange_ids, (), ("521", "23", "--markers")),
     ],
 )
-def test_a_damaged_map_gets_one_sentence(change, columns, words, demo_folder: Path, tmp_path: Path) -> None:
+def test_a_damaged_map_gets_one_sentence(
+    change: Callable[[list[dict]], None],
+    columns: tuple[str, ...],
+    words: tuple[str, ...],
+    demo_folder: Path,
+    tmp_path: Path,
+) -> None:
     markers = damaged_map(tmp_path, change, columns)
     assert_one_sentence(calibrate(demo_folder, tmp_path / "out.json", markers=markers), *words)
     assert not (tmp_path / "out.json").exists()
