@@ -1,0 +1,1 @@
+"""Figures that the project claims, measured, with a committed baseline."""
