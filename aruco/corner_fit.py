@@ -39,6 +39,8 @@ OUTLIER_SIGMAS = 2.5
 MAX_STEP_PX = 1.0  # a Gauss-Newton step farther than the blur reaches is a guess
 # What no fit of pixels can promise: unmodelled shading, ink and lens errors.
 SIGMA_FLOOR_PX = 0.01
+# Shorter sides are no marker's: such a quad has collapsed.
+MIN_SIDE_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,6 +68,10 @@ FIND = _Pass(half_band_cells=0.75, samples_along=24, steps=4, damping=1e-2)
 MEASURE = _Pass(half_band_cells=0.6, samples_along=64, steps=3, damping=1e-4)
 
 
+# Takes the place of a quad that has collapsed or lies where the lens has no inverse, so that the others go on.
+_STAND_IN = 10.0 * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
 @dataclass(slots=True)
 class _Edges:
     """E edges in the pinhole image: points ``middle + t * half * along``, t in [-1, 1]; ``out`` points outward."""
@@ -88,6 +94,8 @@ def fit_corners(image: NDArray[np.uint8], quads_px: Array, cells: int, camera: C
     Returns:
         The corners; a marker that leaves the image or does not converge has an infinite misfit.
     """
+    if not len(quads_px):
+        return CornerFit(corners_px=quads_px, sigma_px=np.empty((0, 4)), misfit=np.empty(0), shift_px=np.empty(0))
     corners = _straighten(camera, quads_px)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         corners, _, _ = _measure(image, corners, cells, camera, FIND)
@@ -104,9 +112,12 @@ def _measure(
     image: NDArray[np.uint8], corners: Array, cells: int, camera: Camera | None, how: _Pass
 ) -> tuple[Array, Array, Array]:
     """One round: corners (n, 4, 2) in the pinhole image, their variance (n, 4), the misfit (n,) of the worst edge."""
-    edges = _edges(corners)
+    side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min(axis=1)
+    usable = np.isfinite(corners).all(axis=(1, 2)) & (side >= MIN_SIDE_PX)
+    edges = _edges(np.where(usable[:, None, None], corners, _STAND_IN))
     lines = _fit_steps(_Band(image, edges, cells, camera, how), how)
     refined, variance = _intersect(edges, lines)
+    refined[~usable] = np.nan
     return refined, variance, lines.misfit.reshape(-1, 4).max(axis=1)
 
 

@@ -97,6 +97,8 @@ class MarkerDetector:
 
     def _find(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Ids (n,) ascending and plain corners (n, 4, 2) [px]."""
+        if not grey.size:
+            return np.empty(0, np.int64), np.empty((0, 4, 2))
         quads, ids, _ = self._cv.detectMarkers(grey)
         if ids is None or not len(ids):
             return np.empty(0, np.int64), np.empty((0, 4, 2))
@@ -121,14 +123,19 @@ def diagnose_dictionaries(images: Sequence[NDArray[np.uint8]], known_ids: Collec
         Dictionary name -> markers found with an id of the map, most first. Only dictionaries that find at least a
         quarter of what the best one finds are named: every dictionary decodes some noise.
     """
+    # OpenCV spells some names twice (36h11, 36H11), one dictionary each.
+    names = {getattr(cv2.aruco, name): name for name in dictionary_names()}.values()
     counts: dict[str, int] = {}
-    for name in dictionary_names():
+    for name in sorted(names, key=lambda name: (len(get_dictionary(name).bytesList), name)):
         detector = MarkerDetector(name, known_ids)
         counts[name] = sum(len(detector._find(_grey(image))[0]) for image in images)
     best = max(counts.values(), default=0)
     named = {name: n for name, n in counts.items() if n and n >= best / 4}
-    return dict(sorted(named.items(), key=lambda item: (-item[1], item[0])))
+    # Among equals the smallest dictionary first: it was meant, or finds the same with less noise.
+    return dict(sorted(named.items(), key=lambda item: -item[1]))
 
 
 def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    if image.ndim == 2 or not image.size:
+        return image
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

@@ -43,12 +43,14 @@ def place_cameras(views: Sequence[View], scale2: Mapping[str, float]) -> RigEsti
         lost |= {name: _why_lost(name, by_camera, links) for name in T_root_cam}
         return RigEstimate(cameras={}, lost=lost, T_world_target={})
     T_root_target = {frame: _target(chosen[frame], T_root_cam) for frame in chosen}
-    T_world_root = invert_transform(T_root_target[_first_well_seen(chosen)])
+    world_frame = _first_well_seen(chosen)
+    T_world_root = invert_transform(T_root_target[world_frame])
     T_world_cam = {name: T_world_root @ T for name, T in T_root_cam.items()}
     return RigEstimate(
         cameras={name: _placement(name, T_world_cam, chosen, by_camera[name], scale2) for name in T_world_cam},
         lost=lost,
         T_world_target={frame: T_world_root @ T for frame, T in T_root_target.items()},
+        world_frame=world_frame,
     )
 
 
@@ -62,7 +64,7 @@ def _best_tree(cameras: Iterable[str], links: Sequence[CameraLink]) -> list[Came
             for name in merged:
                 part[name] = merged
             tree.append(link)
-    largest = max(part.values(), key=lambda names: (len(names), [-ord(c) for c in min(names)]))
+    largest = min(part.values(), key=lambda names: (-len(names), min(names)))
     return [link for link in tree if link.i in largest] or [_alone(min(largest))]
 
 

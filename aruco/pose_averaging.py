@@ -98,7 +98,10 @@ def _medoid(poses: Sequence[Pose]) -> int:
         return 0
     # Hundreds of measurements show their middle as well as thousands do.
     pick = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 200)).astype(int))
-    pairs = np.array([[pose_distance(poses[i], poses[j]) for j in pick] for i in pick])
+    T = np.array([poses[i] for i in pick])
+    R = T[:, :3, :3].reshape(len(T), 9)
+    angle = np.arccos(np.clip((R @ R.T - 1) / 2, -1, 1))  # from the traces of all relative rotations
+    pairs = np.stack([angle, np.linalg.norm(T[:, None, :3, 3] - T[:, :3, 3], axis=2)], axis=2)
     scale = np.median(pairs, axis=(0, 1)) + np.array([MIN_SPREAD_RAD, MIN_SPREAD_M])
     cost = np.median((pairs / scale).sum(axis=2), axis=1)
     return int(pick[np.argmin(cost)])

@@ -59,7 +59,8 @@ def place_cameras(views: Sequence[View], scale2: Mapping[str, float]) -> RigEsti
         else:
             cameras[name] = _placement(mine, best.T_cam_target, scale2[name])
     frames = sorted({frame for placement in cameras.values() for frame in placement.frames})
-    return RigEstimate(cameras=cameras, lost=lost, T_world_target={frame: np.eye(4) for frame in frames})
+    targets = {frame: np.eye(4) for frame in frames}
+    return RigEstimate(cameras=cameras, lost=lost, T_world_target=targets, world_frame=frames[0] if frames else 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

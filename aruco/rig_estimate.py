@@ -32,10 +32,11 @@ class RigEstimate:
     cameras: Mapping[str, Placement]
     lost: Mapping[str, str]  # camera -> reason
     T_world_target: Mapping[int, Pose]  # frame -> pose
+    world_frame: int = 0  # the frame whose target carries the world
 
     def turned(self, R_new_world: Array) -> RigEstimate:
         """The same rig in a world that is turned about its origin by a (3, 3) rotation."""
         turn = make_pose(R_new_world, np.zeros(3))
         cameras = {name: replace(p, T_world_cam=turn @ p.T_world_cam) for name, p in self.cameras.items()}
         target = {frame: turn @ T for frame, T in self.T_world_target.items()}
-        return RigEstimate(cameras=cameras, lost=self.lost, T_world_target=target)
+        return replace(self, cameras=cameras, T_world_target=target)

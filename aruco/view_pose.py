@@ -18,13 +18,25 @@ import numpy as np
 
 from aruco import lens
 from aruco.model import Camera, Detection
-from aruco.pose_math import Array, Pose, exp_se3, make_pose, pose_distance, rvec_tvec_to_matrix, skew
+from aruco.pose_math import (
+    Array,
+    Pose,
+    exp_se3,
+    invert_transform,
+    make_pose,
+    pose_distance,
+    rvec_tvec_to_matrix,
+    skew,
+    transform_points,
+)
 
 # Rivals differ by the tilt that a reflection about the viewing ray gives: far more than this, even for flat views.
 SAME_POSE_RAD = np.radians(1.0)
 SAME_POSE_SHARE = 0.01  # of the distance
+# Starts this many times farther apart still end in one place, and are refined once.
+TWIN_STARTS = 3.0
 MAX_RIVALS = 4
-MAX_STEPS = 30
+MAX_STEPS = 100  # from a far start; from a near one it takes five
 CONVERGED = 1e-9
 # A rival is ruled out when its misfit is worse by five standard deviations of the corners' noise; what the fit of one
 # square's edges promises is optimistic for real lenses and prints, so the noise is never taken below MIN_SIGMA_PX.
@@ -99,16 +111,32 @@ def _starts(K: Array, points: Array, pixels: Array, sigma: Array) -> list[Pose]:
     """Both planar solutions of every marker, and the general one, best first and without near twins."""
     found: list[Pose] = []
     for k in range(0, len(points), 4):
-        found += _pnp(K, points[k : k + 4], pixels[k : k + 4], cv2.SOLVEPNP_IPPE)
+        found += _planar(K, points[k : k + 4], pixels[k : k + 4])
     if len(points) > 4:
         found += _pnp(K, points, pixels, cv2.SOLVEPNP_SQPNP)
     in_front = [T for T in found if (points @ T[2, :3] + T[2, 3] > 0).all()]
     cost = [float((_residuals(K, points, pixels, T)[0] ** 2).sum()) for T in in_front]
     kept: list[Pose] = []
     for k in np.argsort(cost, kind="stable"):
-        if len(kept) < MAX_RIVALS and not any(_same(in_front[k], T, rough=10.0) for T in kept):
+        if len(kept) < MAX_RIVALS and not any(_same(in_front[k], T, rough=TWIN_STARTS) for T in kept):
             kept.append(in_front[k])
     return kept
+
+
+def _planar(K: Array, corners: Array, pixels: Array) -> list[Pose]:
+    """Both solutions of one marker."""
+    # In the marker's own plane: for some planes of the target's frame (z = 0.3 seen from +z) OpenCV 4.14's IPPE is
+    # wrong by half a turn.
+    x, down = corners[1] - corners[0], corners[3] - corners[0]
+    z = np.cross(x, down)
+    if not np.linalg.norm(z) > 0:
+        return []
+    x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
+    R = np.array([x, np.cross(z, x), z], dtype=np.float64).T
+    T_target_marker = make_pose(R, corners.mean(axis=0))
+    T_marker_target = invert_transform(T_target_marker)
+    on_plane = transform_points(T_marker_target, corners) * [1.0, 1.0, 0.0]
+    return [T_cam_marker @ T_marker_target for T_cam_marker in _pnp(K, on_plane, pixels, cv2.SOLVEPNP_IPPE)]
 
 
 def _pnp(K: Array, points: Array, pixels: Array, method: int) -> list[Pose]:
