@@ -48,6 +48,8 @@ INCOMPLETE = 3  # exit code: poses were written, but not of every camera
               help="Use at most N of these, spread over the recording.")  # fmt: skip
 @click.option("--min-markers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
               help="Leave out views with fewer markers.")  # fmt: skip
+@click.option("--joint/--no-joint", default=True, show_default=True,
+              help="Adjust all cameras and frames together, with uncertainty; or keep the average.")  # fmt: skip
 @click.option("--preview/--no-preview", default=False, show_default=True,
               help="Write annotated frames into a folder beside the output.")  # fmt: skip
 @click.option("--seed", type=int, default=0, show_default=True, help="For every random choice.")
@@ -108,6 +110,7 @@ def _config(given: dict[str, Any]) -> CalibrateConfig:
             up_axis=given["up_axis"],
         ),
         moving_target=given["moving_target"],
+        joint=given["joint"],
         seed=given["seed"],
     )
 

@@ -158,17 +158,17 @@ SILENT: Progress = _Silent()
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Detection:
-    """The markers found in one image."""
+    """What was found of the target in one image: markers with four corners, or single points of a board (k = 1)."""
 
     ids: NDArray[np.int64]  # (n,), ascending
-    corners_px: Array  # (n, 4, 2) in ArUco order
-    sigma_px: Array  # (n, 4) standard deviation of a corner's coordinate, from the fit of its edges
+    corners_px: Array  # (n, k, 2); a marker's k = 4 corners in ArUco order
+    sigma_px: Array  # (n, k) standard deviation of a corner's coordinate, from the fit of its edges
 
     def __post_init__(self) -> None:
         """Check shapes and freeze."""
-        n = len(self.ids)
-        if self.corners_px.shape != (n, 4, 2) or self.sigma_px.shape != (n, 4):
-            raise ValueError(f"want (n, 4, 2) corners and (n, 4) sigmas for {n} ids")
+        n, shape = len(self.ids), self.corners_px.shape
+        if len(shape) != 3 or shape[0] != n or shape[1] < 1 or shape[2] != 2 or self.sigma_px.shape != shape[:2]:
+            raise ValueError(f"want (n, k, 2) corners and (n, k) sigmas for {n} ids")
         for array in (self.ids, self.corners_px, self.sigma_px):
             array.setflags(write=False)
 
@@ -202,6 +202,7 @@ class CameraPose:
     rms_px: float  # reprojection over all corners, per corner (both coordinates)
     spread_m: float  # root mean square distance of single views from the average
     spread_rad: float
+    covariance: Array | None = None  # (6, 6) of the left perturbation (rotation, translation), world axes
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

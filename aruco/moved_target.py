@@ -42,7 +42,7 @@ def place_cameras(views: Sequence[View], scale2: Mapping[str, float]) -> RigEsti
     if not chosen or (len(T_root_cam) == 1 and len(by_camera) > 1):
         lost |= {name: _why_lost(name, by_camera, links) for name in T_root_cam}
         return RigEstimate(cameras={}, lost=lost, T_world_target={})
-    T_root_target = {frame: _target(chosen[frame], T_root_cam) for frame in chosen}
+    T_root_target = {frame: _target(chosen[frame], T_root_cam, scale2) for frame in chosen}
     world_frame = _first_well_seen(chosen)
     T_world_root = invert_transform(T_root_target[world_frame])
     T_world_cam = {name: T_world_root @ T for name, T in T_root_cam.items()}
@@ -126,12 +126,14 @@ def _heaviest(options: Sequence[tuple[View, Candidate]], row: np.ndarray, weight
     return support
 
 
-def _target(solutions: Mapping[str, Candidate], T_root_cam: Mapping[str, Pose], without: str = "") -> Pose:
+def _target(
+    solutions: Mapping[str, Candidate], T_root_cam: Mapping[str, Pose], scale2: Mapping[str, float], without: str = ""
+) -> Pose:
     """The mean pose of the target in one frame, if wished without one camera's word."""
     used = [name for name in solutions if name != without]
     # Information is stated in camera axes; carried to the root's axes it weighs each camera where it knows much.
     poses = [T_root_cam[name] @ solutions[name].T_cam_target for name in used]
-    return average_poses(poses, [_carried(solutions[name], T_root_cam[name]) for name in used]).T
+    return average_poses(poses, [_carried(solutions[name], T_root_cam[name]) / scale2[name] for name in used]).T
 
 
 def _carried(candidate: Candidate, T_root_cam: Pose) -> np.ndarray:
@@ -151,7 +153,7 @@ def _placement(
     mine = {frame: solutions[name] for frame, solutions in chosen.items() if name in solutions}
     errors = [
         pose_distance(
-            _target(chosen[frame], T_world_cam, without=name) @ invert_transform(candidate.T_cam_target),
+            _target(chosen[frame], T_world_cam, scale2, without=name) @ invert_transform(candidate.T_cam_target),
             T_world_cam[name],
         )
         for frame, candidate in mine.items()
@@ -169,6 +171,8 @@ def _placement(
 
 
 def _why_lost(name: str, by_camera: Mapping[str, Mapping[int, View]], links: Sequence[CameraLink]) -> str:
+    if len(by_camera) == 1:
+        return "every view leaves two poses possible: turn the target so that the camera sees two faces"
     shared = {other: len(by_camera[name].keys() & by_camera[other].keys()) for other in by_camera if other != name}
     if not any(shared.values()):
         return "no frame in which another camera sees the target too: put the target where two cameras see it"

@@ -1,131 +1,128 @@
 """Camera poses from a target that rests: its frame is the world.
 
-Owns      choosing among the rival solutions of a camera's views, and averaging over its frames.
+Owns      the frames in which it rests, the rival solutions of all of them together, averaging over them.
 Leaves    a target that is moved to moved_target.
 
-A camera's views of a resting target all measure one pose. A rival solution of one view may fit that view a little
-better by chance, but only the true pose explains all of them.
+A camera's views of a resting target show the same corners, so whether it rests is seen in the images, without any
+pose. Single views of a small square seen nearly face on have two solutions and scatter by tens of degrees; corners
+averaged over all frames have less noise, and what rivals remain are those of the camera's whole recording.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from aruco.errors import CalibrationError
+from aruco.merged_detection import REST_PX, frames_at_rest, merge_detections
+from aruco.model import Camera, Detection
 from aruco.pose_averaging import PoseAverage, average_poses
 from aruco.pose_math import Array, Pose, adjoint, invert_transform, pose_distance
 from aruco.rig_estimate import Placement, RigEstimate
-from aruco.view_pose import RULED_OUT_CHI2, Candidate, View
+from aruco.view_pose import Candidate, View, solve_view
 
-# Two views of one resting target agree far better than this, and the rivals of a square differ by more.
-SAME_HYPOTHESIS_RAD = np.radians(6.0)
-SAME_HYPOTHESIS_SHARE = 0.06  # of the distance
-# A view that a hypothesis does not explain at all costs this much, in the corners' variance.
-UNEXPLAINED_CHI2 = 4 * RULED_OUT_CHI2
-# A resting target has two or four; a moved one as many as frames, which need not all be counted to be refused.
-MAX_HYPOTHESES = 20
-# When fewer views than this agree on where the target is, it did not rest.
-MIN_AGREEING_SHARE = 0.5
+# A single view's solution belongs to the pose that all frames give together if it is nearer than this; the rival of
+# a square lies farther off.
+SAME_SOLUTION_RAD = np.radians(6.0)
+SAME_SOLUTION_SHARE = 0.06  # of the distance
+# When in fewer frames than this the corners stay where they mostly are, the target did not rest.
+MIN_RESTING_SHARE = 0.5
+NOT_AT_REST = (
+    "The target does not stay in one place: if it was moved between frames, pass --moving-target; otherwise cut the "
+    "recording to the part in which it rests."
+)
 
 
-def place_cameras(views: Sequence[View], scale2: Mapping[str, float]) -> RigEstimate:
+def place_cameras(
+    cameras: Sequence[Camera],
+    views: Sequence[View],
+    detections: Mapping[str, Mapping[int, Detection]],
+    geometry: Mapping[int, Array],
+    scale2: Mapping[str, float],
+) -> RigEstimate:
     """Every camera's pose in the frame of a target that rests.
 
     Args:
+        cameras: Those of the recording.
         views: Of all cameras.
+        detections: Camera -> frame -> markers, at least for the frames of the views.
+        geometry: Marker id -> (k, 3) points [m], target frame.
         scale2: Camera -> factor on the corners' variances, from the residuals of all its views.
 
     Returns:
         The cameras that could be placed, and why the others could not.
 
     Raises:
-        CalibrationError: Most views disagree on where the target is: it did not rest.
+        CalibrationError: The corners do not stay where they are: the target did not rest.
     """
-    by_camera = {name: [v for v in views if v.camera == name] for name in sorted({v.camera for v in views})}
-    hypotheses = {name: _ranked(mine, scale2[name]) for name, mine in by_camera.items()}
-    _require_rest(by_camera, hypotheses)
-    cameras: dict[str, Placement] = {}
+    placed: dict[str, Placement] = {}
     lost: dict[str, str] = {}
-    for name, mine in by_camera.items():
-        best, *rivals = hypotheses[name]
-        if rivals and rivals[0].cost - best.cost < RULED_OUT_CHI2:
-            lost[name] = (
-                f"{len(mine)} views leave two poses possible (a marker seen nearly face on): turn the target so that "
-                "this camera sees two faces, or record more frames"
-            )
-        else:
-            cameras[name] = _placement(mine, best.T_cam_target, scale2[name])
-    frames = sorted({frame for placement in cameras.values() for frame in placement.frames})
+    in_order = sorted(cameras, key=lambda camera: camera.name)
+    seen = {camera: [view for view in views if view.camera == camera.name] for camera in in_order}
+    resting = {
+        camera.name: frames_at_rest({view.frame: detections[camera.name][view.frame] for view in mine})
+        for camera, mine in seen.items()
+        if mine
+    }
+    _require_rest(resting, len(views))
+    for camera, mine in seen.items():
+        if mine and not resting[camera.name]:
+            lost[camera.name] = "its views show the target in another place each time"
+        elif mine:
+            merged = merge_detections([detections[camera.name][frame] for frame in resting[camera.name]])
+            whole = solve_view(camera, min(resting[camera.name]), merged, geometry)
+            _require_one_place(whole, mine)
+            result = _place(whole, mine, resting[camera.name], scale2[camera.name])
+            (lost if isinstance(result, str) else placed)[camera.name] = result  # pyright: ignore[reportArgumentType]
+    frames = sorted({frame for placement in placed.values() for frame in placement.frames})
     targets = {frame: np.eye(4) for frame in frames}
-    return RigEstimate(cameras=cameras, lost=lost, T_world_target=targets, world_frame=frames[0] if frames else 0)
+    return RigEstimate(cameras=placed, lost=lost, T_world_target=targets, world_frame=frames[0] if frames else 0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Hypothesis:
-    """A pose of the target that some view proposes, and what all views of the camera think of it."""
-
-    T_cam_target: Pose
-    cost: float  # in variances of the corners
-    n_explained: int  # views with a solution there
+def _require_rest(resting: Mapping[str, Sequence[int]], n_views: int) -> None:
+    if sum(map(len, resting.values())) < MIN_RESTING_SHARE * n_views:
+        raise CalibrationError(NOT_AT_REST)
 
 
-def _ranked(views: Sequence[View], scale2: float) -> list[_Hypothesis]:
-    ranked = [
-        _Hypothesis(T, sum(_cost(v, T, scale2) for v in views), sum(_explaining(v, T) is not None for v in views))
-        for T in _hypotheses(views)
-    ]
-    return sorted(ranked, key=lambda h: h.cost)
+def _require_one_place(whole: View | None, views: Sequence[View]) -> None:
+    """Markers that never show in one frame cannot be seen to move, but then no pose explains all of them together."""
+    single_px = float(np.median([view.best.rms_px for view in views]))
+    if whole is not None and len(views) > 1 and whole.best.rms_px > 3 * single_px + REST_PX:
+        raise CalibrationError(NOT_AT_REST)
 
 
-def _require_rest(by_camera: Mapping[str, Sequence[View]], hypotheses: Mapping[str, Sequence[_Hypothesis]]) -> None:
-    agreeing = sum(ranked[0].n_explained for ranked in hypotheses.values())
-    if agreeing < MIN_AGREEING_SHARE * sum(map(len, by_camera.values())):
-        raise CalibrationError(
-            "The views do not agree on where the target rests: if it was moved between frames, pass --moving-target; "
-            "otherwise cut the recording to the part in which it rests."
+def _place(whole: View | None, views: Sequence[View], resting: Sequence[int], scale2: float) -> Placement | str:
+    """One camera's placement from all its frames together and one by one, or why there is none."""
+    if whole is None:
+        return f"no pose in front of the camera explains its {len(views)} views: check the marker map"
+    # Few residuals say little about the noise: the sigmas count as much as eight of them.
+    if whole.is_ambiguous(max(1.0, (whole.best.chi2 + 8.0) / (whole.dof + 8.0))):
+        return (
+            f"{len(views)} views leave two poses possible (a marker seen nearly face on): turn the target so that this "
+            "camera sees two faces, or record more frames"
         )
-
-
-def _placement(views: Sequence[View], T_cam_target: Pose, scale2: float) -> Placement:
-    explained = [(view, c) for view in views if (c := _explaining(view, T_cam_target)) is not None]
-    average = _average([c for _, c in explained])
-    used = [view for (view, _), keep in zip(explained, average.inliers) if keep]
+    at_rest = [view for view in views if view.frame in set(resting)]
+    matching = [c for view in at_rest if (c := _solution_near(view, whole.best.T_cam_target)) is not None]
+    trusted = len(matching) >= len(at_rest) / 2
+    average = _average(matching if trusted else [whole.best])
     return Placement(
         T_world_cam=average.T,
         spread_rad=average.spread_rad,
         spread_m=average.spread_m,
-        frames=tuple(view.frame for view in used),
+        frames=tuple(view.frame for view in at_rest),
         n_views=len(views),
         n_ambiguous=sum(view.is_ambiguous(scale2) for view in views),
     )
 
 
-def _hypotheses(views: Sequence[View]) -> list[Pose]:
-    """Distinct poses that some view proposes, the better ones first."""
-    kept: list[Pose] = []
-    for candidate in sorted((c for view in views for c in view.candidates), key=lambda c: c.chi2):
-        if len(kept) < MAX_HYPOTHESES and not any(_same(candidate.T_cam_target, T) for T in kept):
-            kept.append(candidate.T_cam_target)
-    return kept
-
-
-def _same(T_a: Pose, T_b: Pose) -> bool:
-    angle, distance = pose_distance(T_a, T_b)
-    return angle < SAME_HYPOTHESIS_RAD and distance < SAME_HYPOTHESIS_SHARE * float(np.linalg.norm(T_b[:3, 3]))
-
-
-def _explaining(view: View, T_cam_target: Pose) -> Candidate | None:
-    return next((c for c in view.candidates if _same(c.T_cam_target, T_cam_target)), None)
-
-
-def _cost(view: View, T_cam_target: Pose, scale2: float) -> float:
-    candidate = _explaining(view, T_cam_target)
-    if candidate is None:
-        return UNEXPLAINED_CHI2
-    return min((candidate.chi2 - view.best.chi2) / scale2, UNEXPLAINED_CHI2)
+def _solution_near(view: View, T_cam_target: Pose) -> Candidate | None:
+    reach = SAME_SOLUTION_SHARE * float(np.linalg.norm(T_cam_target[:3, 3]))
+    for candidate in view.candidates:
+        angle, distance = pose_distance(candidate.T_cam_target, T_cam_target)
+        if angle < SAME_SOLUTION_RAD and distance < reach:
+            return candidate
+    return None
 
 
 def _average(candidates: Sequence[Candidate]) -> PoseAverage:

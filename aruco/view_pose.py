@@ -4,13 +4,13 @@ Owns      PnP over all markers seen together, its two-fold ambiguities, the info
 Leaves    choosing between rivals by other frames and cameras to resting_target and moved_target.
 
 A square seen nearly face on has two poses of nearly equal error (Collins and Bartoli, "Infinitesimal plane-based pose
-estimation", 2014), and so have two faces of a box seen frontally. Every marker therefore offers both of its planar
-solutions, all corners together refine them, and what ends in different places is kept apart.
+estimation", 2014), and iterations started from the wrong one of a box's face may stay there. Every marker therefore
+offers both of its planar solutions, all corners together refine them, and what ends in different places is kept apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -78,6 +78,16 @@ class View:
         if len(self.candidates) < 2:
             return False
         return self.candidates[1].chi2 - self.best.chi2 < RULED_OUT_CHI2 * scale2
+
+
+def variance_factor(views: Sequence[View]) -> float:
+    """How many times larger than promised the variance of a camera's corners is, by the views' own residuals.
+
+    The median over views of chi2 beside the median that its degrees of freedom promise (Wilson and Hilferty 1931);
+    never below one.
+    """
+    ratios = [view.best.chi2 / (view.dof * (1 - 2 / (9 * view.dof)) ** 3) for view in views]
+    return max(1.0, float(np.median(ratios)))
 
 
 def solve_view(camera: Camera, frame: int, detection: Detection, geometry: Mapping[int, Array]) -> View | None:

@@ -47,6 +47,7 @@ class CalibrateConfig:
     detect: DetectConfig = field(default_factory=DetectConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     moving_target: bool = False
+    joint: bool = True  # adjust all cameras and frames together after the average
     seed: int = 0
 
     def as_dict(self) -> dict[str, Any]:

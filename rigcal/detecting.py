@@ -148,7 +148,7 @@ def _search(
     counter: _Counter,
     on_frame: OnFrame | None,
 ) -> Iterator[_Outcome]:
-    for index, frame in zip(task.frames, recording.frames(task.camera.name, task.indices)):
+    for index, frame in zip(task.frames, recording.frames(task.camera.name, task.indices), strict=True):
         if isinstance(frame, BadFrame):
             logger.debug("camera {}: frame left out: {}", task.camera.name, frame.reason)
             yield _Outcome(frame=index, bad=frame.reason)

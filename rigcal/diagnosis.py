@@ -44,6 +44,11 @@ def require_views(
         raise InputError(f"No image of any camera could be read ({reason}); check the recording.")
     images = list(_first_images(recording))
     most = max((len(d) for s in seen.values() for d in s.detections.values()), default=0)
+    if most >= config.min_markers:
+        raise CalibrationError(
+            f"Markers of the map were seen, at most {most} at once, but no pose in front of a camera explains them; "
+            "check that the marker map and the intrinsics belong to this recording."
+        )
     if most:
         raise CalibrationError(
             f"No image shows {config.min_markers} markers of the map at once, at most {most}; lower --min-markers."
@@ -106,7 +111,7 @@ def cameras_without_views(recording: Recording, sync: SyncResult, seen: Mapping[
         elif not counts.with_markers:
             reasons[camera.name] = f"never sees the target in {counts.read} frames"
         else:
-            reasons[camera.name] = f"sees too few markers for a pose in {counts.with_markers} frames"
+            reasons[camera.name] = f"none of its {counts.with_markers} frames with markers gives a pose"
     return reasons
 
 

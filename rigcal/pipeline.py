@@ -19,17 +19,19 @@ from aruco import alignment, moved_target, resting_target
 from aruco.detector import MarkerDetector
 from aruco.errors import CalibrationError, InputError
 from aruco.marker_geometry import Face, load_faces
-from aruco.model import SILENT, Calibration, CameraPose, Progress, Recording
+from aruco.model import SILENT, Calibration, Camera, CameraPose, Progress, Recording
 from aruco.moved_alignment import find_up_moved
-from aruco.pose_math import Array
+from aruco.pose_math import Array, Pose, make_pose
 from aruco.reprojection import Reprojection, reproject
 from aruco.rig_estimate import Placement, RigEstimate
 from aruco.svo_sync import SyncResult, sample, synchronise
-from aruco.view_pose import View
+from aruco.uncertainty import carried
+from aruco.view_pose import variance_factor
 from rigcal import diagnosis
 from rigcal.config import AlignConfig, CalibrateConfig, FrameConfig, Resources
 from rigcal.detecting import OnFrame, Seen, digest_of, watch
 from rigcal.preview_writer import PreviewWriter
+from rigcal.solve.joint import JointRig, adjust_rig
 from rigcal.sources import open_recordings
 
 
@@ -84,15 +86,21 @@ def calibrate(
         on_frame=on_frame,
     )
     diagnosis.require_views(recording, target.geometry, config.detect, seen)
-    rig = place_cameras(seen, moving=config.moving_target)
-    rig, aligned, up = align(rig, target.faces, config.align, moving=config.moving_target)
+    rig = place_cameras(recording.cameras, seen, target.geometry, moving=config.moving_target)
+    joint = adjust(rig, recording, seen, target, config) if config.joint else None
+    rig = rig if joint is None else joint.rig
+    T_aligned_world, aligned = align(rig, target.faces, config.align, moving=config.moving_target)
+    rig = rig.turned(T_aligned_world[:3, :3])
     residuals = reproject({c.name: c for c in recording.cameras}, rig, _used_detections(rig, seen), target.geometry)
     return Calibration(
-        cameras=tuple(_camera_pose(name, rig.cameras[name], residuals[name], seen[name]) for name in rig.cameras),
+        cameras=tuple(
+            _camera_pose(name, rig.cameras[name], residuals[name], seen[name], joint, T_aligned_world)
+            for name in rig.cameras
+        ),
         lost={**diagnosis.cameras_without_views(recording, sync, seen), **rig.lost},
-        up=up,
+        up=config.align.up_axis if config.align.enabled else None,
         frames={name: s.counts for name, s in seen.items()},
-        notes={**aligned, **_notes(recording, target, config, sync, groups, seen)},
+        notes={**aligned, **_adjustment_note(joint), **_notes(recording, target, config, sync, groups, seen)},
     )
 
 
@@ -133,34 +141,50 @@ def choose_frames(recording: Recording, config: FrameConfig) -> tuple[SyncResult
     return sync, sample(sync.groups, config.sample_interval, config.max_samples)
 
 
-def place_cameras(seen: Mapping[str, Seen], *, moving: bool) -> RigEstimate:
+def place_cameras(
+    cameras: Sequence[Camera], seen: Mapping[str, Seen], geometry: Mapping[int, Array], *, moving: bool
+) -> RigEstimate:
     """The rig, from the views of a target that rests or is moved.
 
     Raises:
         CalibrationError: No camera could be placed, or a target that should rest was moved.
     """
     views = [view for s in seen.values() for view in s.views]
-    scale2 = {name: _variance_factor(s.views) for name, s in seen.items() if s.views}
-    rig = (moved_target if moving else resting_target).place_cameras(views, scale2)
+    scale2 = {name: variance_factor(s.views) for name, s in seen.items() if s.views}
+    if moving:
+        rig = moved_target.place_cameras(views, scale2)
+    else:
+        detections = {name: s.detections for name, s in seen.items()}
+        rig = resting_target.place_cameras(cameras, views, detections, geometry, scale2)
     if not rig.cameras:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in rig.lost.items())
         raise CalibrationError(f"No camera could be placed. {reasons}.")
     return rig
 
 
-def _variance_factor(views: Sequence[View]) -> float:
-    """How many times larger than promised the variance of a camera's corners is, by the views' own residuals."""
-    ratios = [view.best.chi2 / view.dof for view in views]
-    # The median of chi2 over its degrees of freedom is 0.7 for one marker and tends to 1 for many.
-    return max(1.0, float(np.median(ratios)) / 0.7)
+def adjust(
+    rig: RigEstimate, recording: Recording, seen: Mapping[str, Seen], target: Target, config: CalibrateConfig
+) -> JointRig:
+    """All cameras and frames together, from the average on."""
+    detections = {name: s.detections for name, s in seen.items()}
+    return adjust_rig(rig, recording.cameras, detections, target.geometry, moving=config.moving_target)
 
 
-def align(
-    rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, moving: bool
-) -> tuple[RigEstimate, dict[str, Any], Any]:
-    """The rig in an upright world, what to note about it, and the up axis; unchanged unless asked for."""
+def _adjustment_note(joint: JointRig | None) -> dict[str, Any]:
+    if joint is None:
+        return {}
+    note = {
+        "residual_scale": joint.scale,
+        "rejected_views": {name: list(frames) for name, frames in joint.rejected.items()},
+        "odd_markers": {str(marker): ratio for marker, ratio in joint.odd_markers.items()},
+    }
+    return {"adjusted": note}
+
+
+def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, moving: bool) -> tuple[Pose, dict[str, Any]]:
+    """The turn T_aligned_world into an upright world, and what to note about it; the identity unless asked for."""
     if not config.enabled:
-        return rig, {}, None
+        return np.eye(4), {}
     T_world_cam = {name: placement.T_world_cam for name, placement in rig.cameras.items()}
     wish = {"ground_face": config.ground_face, "ground_marker_id": config.ground_marker_id}
     if moving:
@@ -174,14 +198,21 @@ def align(
         "margin": decision.margin,
         "camera_up": {name: [float(-x) for x in T[:3, 1]] for name, T in aligned.T_world_cam.items()},
     }
-    return rig.turned(aligned.R_align), {"aligned": note}, config.up_axis
+    return make_pose(aligned.R_align, np.zeros(3)), {"aligned": note}
 
 
 def _used_detections(rig: RigEstimate, seen: Mapping[str, Seen]) -> dict[str, dict[int, Any]]:
     return {name: {f: seen[name].detections[f] for f in p.frames} for name, p in rig.cameras.items()}
 
 
-def _camera_pose(name: str, placement: Placement, residuals: Reprojection, seen: Seen) -> CameraPose:
+def _camera_pose(
+    name: str,
+    placement: Placement,
+    residuals: Reprojection,
+    seen: Seen,
+    joint: JointRig | None,
+    T_aligned_world: Pose,
+) -> CameraPose:
     return CameraPose(
         camera=name,
         T_world_cam=placement.T_world_cam,
@@ -190,6 +221,7 @@ def _camera_pose(name: str, placement: Placement, residuals: Reprojection, seen:
         rms_px=residuals.rms_px,
         spread_m=placement.spread_m,
         spread_rad=placement.spread_rad,
+        covariance=None if joint is None else carried(joint.covariance[name], T_aligned_world),
         warnings=tuple(diagnosis.warnings(placement, residuals, seen)),
     )
 

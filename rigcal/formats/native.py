@@ -33,6 +33,9 @@ def document(calibration: Calibration) -> dict[str, Any]:
     """The content of an extrinsics file."""
     world = {"up": UP_VECTORS[calibration.up] if calibration.up else None, "origin": "target"}
     meta = {"format": FORMAT, "version": VERSION, "world": world, **calibration.notes}
+    known = {c.camera: c.covariance for c in calibration.cameras if c.covariance is not None}
+    if known:
+        meta["covariance"] = {name: [float(x) for x in covariance.ravel()] for name, covariance in known.items()}
     if calibration.lost:
         meta["without_pose"] = dict(calibration.lost)
     return {**{camera.camera: _entry(camera) for camera in calibration.cameras}, "_meta": meta}

@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from aruco.model import Calibration
+from aruco.model import Calibration, CameraPose
+from aruco.uncertainty import camera_sigma
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,7 +27,19 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
 
     table = Table(title="Cameras", title_justify="left")
     table.add_column("camera")
-    for name in ("frames", "markers", "reprojection\nRMS px", "spread\nmm", "spread\ndegrees", "x m", "y m", "z m"):
+    adjusted = any(camera.covariance is not None for camera in calibration.cameras)
+    known = ("known to\n+- mm", "known to\n+- degrees") if adjusted else ()
+    for name in (
+        "frames",
+        "markers",
+        "reprojection\nRMS px",
+        "spread\nmm",
+        "spread\ndegrees",
+        *known,
+        "x m",
+        "y m",
+        "z m",
+    ):
         table.add_column(name, justify="right")
     for camera in calibration.cameras:
         x, y, z = camera.T_world_cam[:3, 3]
@@ -38,6 +51,7 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
             f"{camera.rms_px:.3f}",
             "-" if alone else f"{1e3 * camera.spread_m:.2f}",
             "-" if alone else f"{math.degrees(camera.spread_rad):.3f}",
+            *_known_to(camera),
             *(f"{value:.3f}" for value in (x, y, z)),
         )
     out.print(table)
@@ -48,6 +62,13 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
         out.print(f"no pose: camera {name}: {reason}", markup=False)
     _show_clock(out, calibration)
     out.print(_world(calibration), markup=False)
+
+
+def _known_to(camera: CameraPose) -> tuple[str, ...]:
+    if camera.covariance is None:
+        return ()
+    sigma = camera_sigma(camera.covariance, camera.T_world_cam)
+    return f"{1e3 * sigma.total_m:.2f}", f"{math.degrees(sigma.total_rad):.3f}"
 
 
 def _show_clock(out: Console, calibration: Calibration) -> None:

@@ -31,6 +31,10 @@ _PANEL_THICKNESS_M = 0.002
 _CARRY_RADIUS_M = 0.7
 _CARRY_HEIGHT_M = 1.0
 _CARRY_TILT_RAD = np.deg2rad(35.0)
+# A board is held up at about this height, and turned in its plane by so much (standard deviation).
+_BOARD_HEIGHT_M = 1.15
+_BOARD_LIFT_M = 0.3
+_BOARD_TURN_RAD = np.deg2rad(30.0)
 _FIRST_SERIAL = 41000001
 
 
@@ -50,6 +54,8 @@ def arrange(rig: Rig, target: Target, rng: np.random.Generator) -> Arrangement:
         InputError: The target has no such face to rest on, or no place shows its markers.
     """
     cameras = tuple(_camera(rig, index, rng) for index in range(rig.n_cameras))
+    if target.board is not None:
+        return _arrange_board(rig, cameras, target, rng)
     T_world_rest = resting_pose(target, rig.resting_face, rng.uniform(0, 2 * np.pi))
     aim = np.array([0.0, 0.5, 0.0]) if rig.moving else T_world_rest[:3, 3]
     T_world_cam = tuple(
@@ -155,15 +161,19 @@ def _camera_pose(
     for trial in range(_TRIALS):
         # Evenly around the target; anywhere if that shows nothing, as with a target printed on few sides.
         spread = 0.3 * sector if trial < 40 else np.pi
-        azimuth = index * sector + rng.uniform(-spread, spread)
-        height, distance = rng.uniform(*rig.camera_height_m), rng.uniform(*rig.distance_m)
-        pitch = np.arcsin(np.clip((height - aim[1]) / distance, -1, 1))
-        level = distance * np.cos(pitch)
-        centre = np.array([aim[0] + level * np.cos(azimuth), height, aim[2] + level * np.sin(azimuth)])
-        T_world_cam = look_at(centre, aim + rng.uniform(-0.15, 0.15, 3), rng.normal(0, np.deg2rad(2)))
+        T_world_cam, pitch = _looking(rig, index * sector + rng.uniform(-spread, spread), aim, rng)
         if pitch < _MAX_PITCH_RAD and seen_markers(camera, T_world_cam, target, T_world_target):
             return T_world_cam
     raise InputError(f"rig {rig.name}: no place shows a marker to camera {camera.name}; let it rest on another face.")
+
+
+def _looking(rig: Rig, azimuth: float, aim: Array, rng: np.random.Generator) -> tuple[Pose, float]:
+    """T_world_cam of a camera in a direction from ``aim`` (3,), which it looks at roughly, and how far down [rad]."""
+    height, distance = rng.uniform(*rig.camera_height_m), rng.uniform(*rig.distance_m)
+    pitch = np.arcsin(np.clip((height - aim[1]) / distance, -1, 1))
+    level = distance * np.cos(pitch)
+    centre = np.array([aim[0] + level * np.cos(azimuth), height, aim[2] + level * np.sin(azimuth)])
+    return look_at(centre, aim + rng.uniform(-0.15, 0.15, 3), rng.normal(0, np.deg2rad(2))), float(pitch)
 
 
 def _carried_pose(
@@ -195,3 +205,54 @@ def _carried(target: Target, rng: np.random.Generator) -> Pose:
         # Held with its middle between the height of its own diagonal and a metre.
         shift[1] = rng.uniform(0.87 * target.body_side_m, _CARRY_HEIGHT_M) - T_world_target[1, 3]
     return make_pose(tilt @ T_world_target[:3, :3], T_world_target[:3, 3] + shift)
+
+
+def _arrange_board(rig: Rig, cameras: tuple[Camera, ...], target: Target, rng: np.random.Generator) -> Arrangement:
+    """Cameras on an arc around +X, and a board that is held up to them."""
+    aim = np.array([0.0, _BOARD_HEIGHT_M, 0.0])
+    sector = np.deg2rad(rig.arc_deg) / rig.n_cameras
+    azimuths = (np.arange(rig.n_cameras) - (rig.n_cameras - 1) / 2) * sector
+    T_world_cam = tuple(_looking(rig, azimuth + rng.uniform(-0.3, 0.3) * sector, aim, rng)[0] for azimuth in azimuths)
+    places = tuple(_held_pose(rig, k, cameras, T_world_cam, target, rng) for k in range(rig.n_frames))
+    return Arrangement(
+        cameras=tuple(_with_options(rig, camera, rng) for camera in cameras),
+        T_world_cam=T_world_cam,
+        T_world_target=places,
+    )
+
+
+def _held_pose(
+    rig: Rig,
+    frame: int,
+    cameras: tuple[Camera, ...],
+    T_world_cam: tuple[Pose, ...],
+    target: Target,
+    rng: np.random.Generator,
+) -> Pose:
+    """A pose in which the camera whose turn it is and another one see at least half of the board's markers."""
+    turn, wanted = frame % len(cameras), sum(len(face.ids) for face in target.faces) / 2
+    for _ in range(_TRIALS):
+        T_world_target = _held(rig, target, rng)
+        sees = [len(seen_markers(c, T, target, T_world_target)) >= wanted for c, T in zip(cameras, T_world_cam)]
+        above = all(transform_points(T_world_target, face.corners)[..., 1].min() > 0 for face in target.faces)
+        if above and sees[turn] and sum(sees) >= min(2, len(cameras)):
+            return T_world_target
+    raise InputError(f"rig {rig.name}: no place shows the board to two cameras at once; give them a wider view.")
+
+
+def _held(rig: Rig, target: Target, rng: np.random.Generator) -> Pose:
+    """A board somewhere near the middle, its print towards somewhere on the cameras' arc, tilted and turned."""
+    facing = np.deg2rad(rig.arc_deg) / 2 * rng.uniform(-1, 1)
+    out = np.array([np.cos(facing), 0.0, np.sin(facing)])
+    # A board's print is seen against its z axis if y runs down, along it if y runs up.
+    upright = look_at(np.zeros(3), -out)[:3, :3]
+    c0, c1, _, c3 = target.faces[0].corners[0]
+    if np.cross(c1 - c0, c3 - c0)[2] < 0:
+        upright = upright @ np.diag([1.0, -1.0, -1.0])
+    axis = rng.normal(size=3)
+    tilt = exp_so3(rng.uniform(0, _CARRY_TILT_RAD) * axis / np.linalg.norm(axis))
+    R = tilt @ upright @ exp_so3(np.array([0.0, 0.0, rng.normal(0, _BOARD_TURN_RAD)]))
+    angle, radius = rng.uniform(0, 2 * np.pi), _CARRY_RADIUS_M * np.sqrt(rng.uniform())
+    height = _BOARD_HEIGHT_M + rng.uniform(-_BOARD_LIFT_M, _BOARD_LIFT_M)
+    middle = np.array([radius * np.cos(angle), height, radius * np.sin(angle)])
+    return make_pose(R, middle - R @ target.centre_m)

@@ -179,7 +179,8 @@ def _seen_prints(panels: tuple[Panel, ...], T_cam_world: Pose) -> Iterator[_Seen
 
 def _seen_print(panel: int, printed: Print, corner: Array, right: Array, down: Array) -> _SeenPrint:
     # The dual basis: right . to_right = 1, down . to_right = 0, and the reverse for the other one.
-    dual = np.asarray(np.linalg.pinv(np.stack([right, down], axis=1)) * len(printed.white), dtype=np.float64)
+    rows, columns = printed.white.shape
+    dual = np.asarray(np.linalg.pinv(np.stack([right, down], axis=1)) * [[columns], [rows]], dtype=np.float64)
     return _SeenPrint(panel=panel, to_cells=dual, shift=-dual @ corner, white=printed.white)
 
 
@@ -248,10 +249,10 @@ def _lay_print(
         return
     rays = np.stack([x[at], y[at], np.ones(len(at[0]))])
     column, row = np.floor((printed.to_cells @ rays) * z[at] + printed.shift[:, None]).astype(np.int64)
-    n = len(printed.white)
-    inside = (column >= 0) & (column < n) & (row >= 0) & (row < n)
+    n_rows, n_columns = printed.white.shape
+    inside = (column >= 0) & (column < n_columns) & (row >= 0) & (row < n_rows)
     # The margin never covers a neighbour's cells.
-    margin = (column >= -1) & (column <= n) & (row >= -1) & (row <= n) & ~inside & (key[at] % 4 == 0)
+    margin = (column >= -1) & (column <= n_columns) & (row >= -1) & (row <= n_rows) & ~inside & (key[at] % 4 == 0)
     white = np.zeros_like(inside)
     white[inside] = printed.white[row[inside], column[inside]]
     ink = np.select([margin, white, inside], [1, 2, 3], default=0)

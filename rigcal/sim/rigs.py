@@ -12,7 +12,7 @@ from typing import Literal
 from aruco.errors import InputError
 from rigcal.sim.noise import DepthNoise, ImageNoise
 
-TargetKind = Literal["box", "corner"]
+TargetKind = Literal["box", "corner", "board"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +23,7 @@ class Rig:
     summary: str
     target: TargetKind = "box"
     dictionary: str = "DICT_APRILTAG_36h11"
+    board: str = ""  # a target of kind board: its description (aruco.board)
     # A face of the target or a side of its body that lies on the floor.
     resting_face: str = "bottom"
     moving: bool = False  # the target is somewhere else in every frame
@@ -31,6 +32,7 @@ class Rig:
     width: int = 1280
     height: int = 720
     focal_px: float = 700.0  # each camera's own differs by up to 1 %
+    arc_deg: float = 360.0  # the part of a circle around the target on which the cameras stand
     distance_m: tuple[float, float] = (2.0, 3.0)  # from camera to target
     camera_height_m: tuple[float, float] = (1.0, 2.2)
     distortion: bool = False
@@ -63,6 +65,18 @@ RIGS: dict[str, Rig] = {
             summary="an open corner of three printed sides on the floor, 4 cameras",
             target="corner",
             resting_face="b",
+        ),
+        Rig(
+            name="board-moved",
+            summary="a ChArUco board of 7 x 5 squares carried before 4 cameras on an arc",
+            target="board",
+            board="charuco:7x5:0.1:0.075:DICT_4X4_50",
+            dictionary="DICT_4X4_50",
+            moving=True,
+            n_frames=25,
+            arc_deg=160.0,
+            distance_m=(1.8, 2.3),
+            camera_height_m=(0.8, 1.9),
         ),
         Rig(
             name="demo",

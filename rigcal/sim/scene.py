@@ -1,6 +1,6 @@
 """Scenes: flat panels with what is painted and printed on them.
 
-Owns      panels, prints, the lamp, bodies made of panels, a marker target as panels.
+Owns      panels, prints, the lamp, bodies made of panels, marker targets and boards as panels.
 Leaves    rays and shading to render; which things stand where to room and placement.
 
 The world is in metres, right-handed, +Y up, with the floor at y = 0.
@@ -8,6 +8,7 @@ The world is in metres, right-handed, +Y up, with the floor at y = 0.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from aruco.board import AprilGrid, Board, CharucoBoard, board_markers, tag_turns, white_squares
 from aruco.errors import InputError
 from aruco.marker_geometry import Face
 from aruco.pose_math import Array, Pose, transform_points
@@ -30,10 +32,13 @@ _SIDE_TOLERANCE_M = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Print:
-    """A square marker on a panel, with a white margin of one cell around it."""
+    """A pattern of black and white cells on a panel, with a white margin of one cell around it.
 
-    corners: Array  # (4, 3) of the black square, world [m], ArUco's order; seen from -cross(c1 - c0, c3 - c0)
-    white: NDArray[np.bool_]  # (n, n) cells from the corner c0 along c0 -> c1 (columns) and c0 -> c3 (rows)
+    Of prints that overlap, the cells of the later one are seen; margins never cover cells.
+    """
+
+    corners: Array  # (4, 3) of the pattern, world [m], ArUco's order; seen from -cross(c1 - c0, c3 - c0)
+    white: NDArray[np.bool_]  # (rows, columns) from the corner c0 along c0 -> c1 (columns) and c0 -> c3 (rows)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,8 +85,8 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def marker_cells(dictionary: cv2.aruco.Dictionary, marker: int) -> NDArray[np.bool_]:
-    """The cells (n, n) of a marker with its black border; True is white.
+def marker_cells(dictionary: cv2.aruco.Dictionary, marker: int, border_bits: int = 1) -> NDArray[np.bool_]:
+    """The cells (n, n) of a marker with its black border, so many cells wide; True is white.
 
     Raises:
         InputError: The dictionary has no such marker.
@@ -89,7 +94,8 @@ def marker_cells(dictionary: cv2.aruco.Dictionary, marker: int) -> NDArray[np.bo
     count = len(dictionary.bytesList)
     if not 0 <= marker < count:
         raise InputError(f"marker {marker} is not in the dictionary, which has 0 to {count - 1}; choose another one.")
-    return dictionary.generateImageMarker(marker, dictionary.markerSize + 2, borderBits=1) > 0
+    side = dictionary.markerSize + 2 * border_bits
+    return dictionary.generateImageMarker(marker, side, borderBits=border_bits) > 0
 
 
 def box_sides(size_m: Sequence[float]) -> list[tuple[Array, Array]]:
@@ -133,12 +139,18 @@ def cylinder_panels(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
-    """A body with printed markers: a cube centred at the target's origin, or only its printed sides."""
+    """A body with printed markers: a cube centred at the target's origin, or only its printed sides, or a board."""
 
     faces: tuple[Face, ...]
     dictionary: str
     body_side_m: float = 0.6
     closed: bool = True  # False: only the sides that carry markers are there
+    board: Board | None = None  # the target is this board and no body
+
+    @property
+    def centre_m(self) -> Array:
+        """The middle (3,) of the target, target frame."""
+        return np.zeros(3) if self.board is None else self.faces[0].corners.mean(axis=(0, 1))
 
 
 def target_panels(target: Target, T_world_target: Pose) -> list[Panel]:
@@ -150,6 +162,8 @@ def target_panels(target: Target, T_world_target: Pose) -> list[Panel]:
     Raises:
         InputError: The dictionary is unknown or lacks one of the markers.
     """
+    if target.board is not None:
+        return [board_panel(target.board, T_world_target)]
     dictionary = marker_dictionary(target.dictionary)
     pending = [
         Print(corners=corners, white=marker_cells(dictionary, marker))
@@ -172,6 +186,55 @@ def _printed_panel(vertices: Array, prints: Sequence[Print], T_world_target: Pos
         albedo=CARDBOARD_ALBEDO,
         prints=tuple(Print(corners=transform_points(T_world_target, p.corners), white=p.white) for p in prints),
     )
+
+
+def board_panel(board: Board, T_world_board: Pose) -> Panel:
+    """A printed board as it stands in the world, on white paper half a square (or a gap) wider on every side."""
+    prints = _charuco_prints(board) if isinstance(board, CharucoBoard) else _aprilgrid_prints(board)
+    margin = board.square_m / 2 if isinstance(board, CharucoBoard) else board.tag_m * board.spacing / 2
+    points = np.concatenate([p.corners for p in prints])
+    (left, low, _), (right, high, _) = points.min(axis=0) - margin, points.max(axis=0) + margin
+    paper = np.array([[left, low, 0.0], [right, low, 0.0], [right, high, 0.0], [left, high, 0.0]])
+    return Panel(
+        vertices=transform_points(T_world_board, paper),
+        albedo=WHITE_ALBEDO,
+        prints=tuple(Print(corners=transform_points(T_world_board, p.corners), white=p.white) for p in prints),
+    )
+
+
+def _charuco_prints(board: CharucoBoard) -> list[Print]:
+    """The chessboard, and the markers over its white squares; board frame."""
+    dictionary = marker_dictionary(board.dictionary)
+    right, down = board.columns * board.square_m, board.rows * board.square_m
+    whole = np.array([[0.0, 0.0, 0.0], [right, 0.0, 0.0], [right, down, 0.0], [0.0, down, 0.0]])
+    chessboard, markers = white_squares(board), board_markers(board)
+    cells = dictionary.markerSize + 2
+    per_square = cells * board.square_m / board.marker_m
+    margin = round((per_square - cells) / 2)
+    if not math.isclose(per_square, cells + 2 * margin, rel_tol=1e-9):
+        drawn = [Print(corners=corners, white=marker_cells(dictionary, k)) for k, corners in markers.items()]
+        return [Print(corners=whole, white=chessboard), *drawn]
+    # Where cells of markers divide a square evenly, one print of small cells is many times as quick to render.
+    white = np.kron(chessboard, np.ones((cells + 2 * margin,) * 2, dtype=bool)).astype(bool)
+    for marker, (row, column) in zip(markers, np.argwhere(chessboard) * (cells + 2 * margin) + margin):
+        white[row : row + cells, column : column + cells] = marker_cells(dictionary, marker)
+    return [Print(corners=whole, white=white)]
+
+
+def _aprilgrid_prints(board: AprilGrid) -> list[Print]:
+    """The upright tags, and the black squares that touch their corners; board frame."""
+    dictionary, gap = marker_dictionary(board.dictionary), board.tag_m * board.spacing
+    tags = [
+        Print(corners=corners, white=np.rot90(marker_cells(dictionary, marker, board.border_bits), tag_turns(board)))
+        for marker, corners in board_markers(board).items()
+    ]
+    square = gap * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+    between = [
+        Print(corners=square + (board.tag_m + gap) * np.array([column, row, 0.0]), white=np.zeros((1, 1), dtype=bool))
+        for row in range(board.rows + 1)
+        for column in range(board.columns + 1)
+    ]
+    return tags + between
 
 
 def _with_margin(printed: Print) -> Array:

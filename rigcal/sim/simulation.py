@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aruco.board import board_face, board_text, parse_board
 from aruco.errors import InputError
 from aruco.marker_geometry import SHIPPED_MAPS, Face, load_faces
 from aruco.model import Camera, Frame
-from aruco.pose_math import Pose
+from aruco.pose_math import Pose, transform_points
 from rigcal.sim.noise import (
     DepthBias,
     DepthNoise,
@@ -178,6 +179,7 @@ class Simulation:
             "rig": self.rig.name,
             "seed": self.seed,
             "dictionary": self.dictionary,
+            **({} if self.target.board is None else {"board": board_text(self.target.board)}),
             "T_world_target": [pose_text(T) for T in self.T_world_target],
             "depth_bias": biases,
         }
@@ -248,13 +250,12 @@ def simulate(
 
 def simulate_rig(rig: Rig, *, seed: int = 0) -> Simulation:
     """Simulate any rig; see simulate."""
-    file, closed = _TARGETS[rig.target]
-    target = Target(faces=tuple(load_faces(SHIPPED_MAPS / file)), dictionary=rig.dictionary, closed=closed)
+    target = _target(rig)
     placed = arrange(rig, target, generator(seed, Purpose.PLACEMENT))
     room = [floor_panel(), *wall_panels()]
     if rig.furniture:
         centres = [T[:3, 3] for T in placed.T_world_cam]
-        places = [T[:3, 3] for T in placed.T_world_target]
+        places = [transform_points(T, target.centre_m) for T in placed.T_world_target]
         room += furniture_panels(centres, places, generator(seed, Purpose.FURNITURE))
     biases = tuple(_draw_bias(rig, seed, k) for k in range(rig.n_cameras))
     names = [camera.name for camera in placed.cameras]
@@ -270,6 +271,14 @@ def simulate_rig(rig: Rig, *, seed: int = 0) -> Simulation:
         target=target,
         depth_bias=dict(zip(names, biases)),
     )
+
+
+def _target(rig: Rig) -> Target:
+    if rig.target == "board":
+        board = parse_board(rig.board)
+        return Target(faces=(board_face(board),), dictionary=board.dictionary, closed=False, board=board)
+    file, closed = _TARGETS[rig.target]
+    return Target(faces=tuple(load_faces(SHIPPED_MAPS / file)), dictionary=rig.dictionary, closed=closed)
 
 
 def _draw_bias(rig: Rig, seed: int, camera: int) -> DepthBias:

@@ -1,0 +1,1 @@
+"""Joint adjustment: all cameras, frames and corners at once, with honest uncertainty."""

@@ -1,0 +1,200 @@
+"""Joint adjustment: the camera and target poses under which all corners lie best.
+
+Owns      Levenberg-Marquardt on the Schur complement, the robust loss and its scale, the covariance.
+Leaves    residuals and derivatives to problem; which views take part to judge.
+
+Targets are eliminated frame by frame (Schur complement), so a step costs a little for each view and a small dense
+system for the cameras: cost grows linearly with frames (Triggs et al., "Bundle adjustment: a modern synthesis", 2000).
+Corners are weighed by a Cauchy loss, ``k^2 log(1 + e / k^2)`` for the squared distance e, whose k follows the data:
+KAPPA robust standard deviations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aruco.pose_math import Array, exp_se3
+from rigcal.solve.problem import Poses, Sightings, ViewSums, residuals, view_sums
+
+# 95 % efficient for clean Gaussian corners (Holland and Welsch 1977: 2.385), deaf to gross errors.
+KAPPA = 2.385
+# The median distance of a two-dimensional unit normal.
+RAYLEIGH_MEDIAN = 1.17741
+MIN_SCALE = 1e-3
+MAX_STEPS = 60
+RESCALINGS = 6
+SETTLED_SCALE = 0.02
+CONVERGED_COST = 1e-9  # relative
+CONVERGED_STEP = 1e-10  # radians and metres
+START_DAMPING = 1e-6
+MAX_DAMPING = 1e8
+# What the corners' own sigmas are worth when residuals are few: as much as this many residuals.
+PRIOR_DOF = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Adjustment:
+    """The optimum, and what is known about it."""
+
+    poses: Poses
+    residuals: Array  # (n, 2) predicted minus seen, in the corners' standard deviations
+    scale: float  # robust standard deviation of a residual coordinate, in the corners' standard deviations
+    covariance: Array  # (6 c, 6 c) of the left perturbations of all cameras, world axes; zero rows for fixed ones
+    steps: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gauge:
+    """What does not move: it carries the world."""
+
+    fixed_cameras: NDArray[np.bool_]  # (c,)
+    fixed_frames: NDArray[np.bool_]  # (f,)
+
+
+def adjust(sightings: Sightings, start: Poses, gauge: Gauge) -> Adjustment:
+    """Minimise the robust reprojection error over all poses that the gauge leaves free.
+
+    Args:
+        sightings: Corners; every free camera needs at least one view.
+        start: Poses near the optimum.
+        gauge: Fixed cameras and frames, at least one of them.
+    """
+    poses = start
+    sums = view_sums(sightings, poses, np.inf)
+    steps = 0
+    for _ in range(RESCALINGS):
+        scale = _scale(sums.squares)
+        poses, sums, took = _minimise(sightings, poses, gauge, KAPPA * scale)
+        steps += took
+        if abs(_scale(sums.squares) - scale) < SETTLED_SCALE * scale:
+            break
+    scale = _scale(sums.squares)
+    return Adjustment(
+        poses=poses,
+        residuals=residuals(sightings, poses),
+        scale=scale,
+        covariance=_covariance(sightings, poses, gauge, KAPPA * scale),
+        steps=steps,
+    )
+
+
+def _scale(squares: Array) -> float:
+    return max(float(np.sqrt(np.nanmedian(squares))) / RAYLEIGH_MEDIAN, MIN_SCALE)
+
+
+def _minimise(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) -> tuple[Poses, ViewSums, int]:
+    """Levenberg-Marquardt with a fixed loss: the optimum near ``poses``, its sums, and the number of steps tried."""
+    sums = view_sums(sightings, poses, kappa)
+    cost = _cost(sums.squares, kappa)
+    damping = START_DAMPING
+    for step in range(1, MAX_STEPS + 1):
+        d_cam, d_target = _solve(sightings, sums, gauge, damping)
+        moved = Poses(_moved(poses.T_world_cam, d_cam), _moved(poses.T_world_target, d_target))
+        tried = view_sums(sightings, moved, kappa)
+        tried_cost = _cost(tried.squares, kappa)
+        if not tried_cost <= cost:
+            damping *= 10
+            if damping > MAX_DAMPING or max(np.abs(d_cam).max(), np.abs(d_target).max()) < CONVERGED_STEP:
+                return poses, sums, step
+            continue
+        done = cost - tried_cost <= CONVERGED_COST * cost
+        poses, sums, cost, damping = moved, tried, tried_cost, max(damping / 10, 1e-12)
+        if done:
+            return poses, sums, step
+    return poses, sums, MAX_STEPS
+
+
+def _cost(squares: Array, kappa: float) -> float:
+    """The Cauchy loss of all corners; infinite with a corner behind its camera."""
+    cost = float(np.log1p(squares / kappa**2).sum())
+    return kappa**2 * cost if np.isfinite(cost) else np.inf
+
+
+def _moved(T: Array, xi: Array) -> Array:
+    """Poses (k, 4, 4) after left perturbations (k, 6)."""
+    return np.array([exp_se3(x) @ pose if x.any() else pose for x, pose in zip(xi, T)]).reshape(T.shape)
+
+
+def _solve(sightings: Sightings, system: ViewSums, gauge: Gauge, damping: float) -> tuple[Array, Array]:
+    """The damped step of cameras (c, 6) and targets (f, 6)."""
+    H_cam, g_cam, H_target, g_target, E = _blocks(sightings, system)
+    H_cam = _damped(H_cam, damping)
+    inverse = _inverse_targets(_damped(H_target, damping), gauge)
+    S, Y = _schur(H_cam, inverse, E)
+    right = g_cam.ravel() - np.einsum("fij,fj->i", Y, g_target)
+    free = np.repeat(~gauge.fixed_cameras, 6)
+    d_cam = np.zeros(len(free))
+    if free.any():
+        d_cam[free] = -np.linalg.solve(S[np.ix_(free, free)], right[free])
+    d_target = -np.einsum("fij,fj->fi", inverse, g_target + np.einsum("fij,i->fj", E, d_cam))
+    return d_cam.reshape(-1, 6), d_target
+
+
+def _blocks(sightings: Sightings, system: ViewSums) -> tuple[Array, Array, Array, Array, Array]:
+    """H and g of cameras and targets, and the coupling E (f, 6 c, 6)."""
+    n_cam, n_frame = len(sightings.cameras), len(sightings.frames)
+    c, f = sightings.view_camera, sightings.view_frame
+    H_cam, g_cam = np.zeros((n_cam, 6, 6)), np.zeros((n_cam, 6))
+    H_target, g_target = np.zeros((n_frame, 6, 6)), np.zeros((n_frame, 6))
+    np.add.at(H_cam, c, system.W)
+    np.add.at(g_cam, c, -system.g)  # a camera's derivative is the target's with the other sign
+    np.add.at(H_target, f, system.W)
+    np.add.at(g_target, f, system.g)
+    E = np.zeros((n_frame, n_cam, 6, 6))
+    np.add.at(E, (f, c), -system.W)
+    return H_cam, g_cam, H_target, g_target, E.reshape(n_frame, 6 * n_cam, 6)
+
+
+def _damped(H: Array, damping: float) -> Array:
+    diagonal = np.einsum("kii->ki", H)
+    return H + damping * np.maximum(diagonal, 1e-12)[:, :, None] * np.eye(6)
+
+
+def _inverse_targets(H_target: Array, gauge: Gauge) -> Array:
+    """Inverses of the targets' blocks; zero for fixed targets and for frames without a view."""
+    seen = np.einsum("kii->k", H_target) > 1e-9
+    free = seen & ~gauge.fixed_frames
+    inverse = np.zeros_like(H_target)
+    inverse[free] = np.linalg.pinv(H_target[free], rcond=1e-14, hermitian=True)
+    return inverse
+
+
+def _schur(H_cam: Array, inverse: Array, E: Array) -> tuple[Array, Array]:
+    """The cameras' system (6c, 6c) after the targets are eliminated, and ``Y = E H_target^-1`` (f, 6c, 6)."""
+    Y = E @ inverse
+    n = E.shape[1]
+    S = -(Y.transpose(1, 0, 2).reshape(n, -1) @ E.transpose(1, 0, 2).reshape(n, -1).T)
+    for k, block in enumerate(H_cam):
+        S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += block
+    return S, Y
+
+
+def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) -> Array:
+    """(6c, 6c) covariance of all cameras' left perturbations, scaled by the residuals.
+
+    For an M-estimator with psi(r) = w(r) r it is E[psi^2] / E[psi']^2 (X^T X)^-1 (Huber, "Robust statistics", 1981,
+    ch. 7); for the Cauchy loss in two dimensions the mean of psi' is the mean of w^2, which here stays inside the
+    normal equations so that a view full of outliers counts little.
+    """
+    system = view_sums(sightings, poses, kappa, power=2)
+    H_cam, _, H_target, _, E = _blocks(sightings, system)
+    S, _ = _schur(H_cam, _inverse_targets(H_target, gauge), E)
+    free = np.repeat(~gauge.fixed_cameras, 6)
+    covariance = np.zeros_like(S)
+    if free.any():
+        inverse = np.linalg.inv(S[np.ix_(free, free)])
+        covariance[np.ix_(free, free)] = _variance(sightings, system.squares, gauge, kappa) * (inverse + inverse.T) / 2
+    return covariance
+
+
+def _variance(sightings: Sightings, squares: Array, gauge: Gauge, kappa: float) -> float:
+    """Variance of a residual coordinate in the corners' variances, from the residuals and a little from the sigmas."""
+    w2 = (1.0 + squares / kappa**2) ** -2
+    seen = np.zeros(len(sightings.frames), dtype=bool)
+    seen[sightings.view_frame] = True
+    n_free = 6 * int((~gauge.fixed_cameras).sum() + (seen & ~gauge.fixed_frames).sum())
+    dof = max(2 * len(squares) - n_free, 0)
+    return float(((w2 * squares).sum() + PRIOR_DOF) / (dof + PRIOR_DOF) / w2.mean())
