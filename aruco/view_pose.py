@@ -35,6 +35,8 @@ SAME_POSE_RAD = np.radians(1.0)
 SAME_POSE_SHARE = 0.01  # of the distance
 # Starts this many times farther apart still end in one place, and are refined once.
 TWIN_STARTS = 3.0
+# Points this flat, as a share of their extent, are a plane; this narrow, a line.
+FLAT = 1e-3
 MAX_RIVALS = 4
 MAX_STEPS = 100  # from a far start; from a near one it takes five
 CONVERGED = 1e-9
@@ -61,6 +63,7 @@ class View:
     camera: str
     frame: int
     ids: tuple[int, ...]
+    n_corners: int  # of all of them
     candidates: tuple[Candidate, ...]  # best first, at least one
 
     @property
@@ -71,7 +74,7 @@ class View:
     @property
     def dof(self) -> int:
         """Residuals beyond the six that a pose absorbs."""
-        return 8 * len(self.ids) - 6
+        return 2 * self.n_corners - 6
 
     def is_ambiguous(self, scale2: float) -> bool:
         """Whether a rival cannot be ruled out when the corners' variances are ``scale2`` times what they say."""
@@ -110,18 +113,29 @@ def solve_view(camera: Camera, frame: int, detection: Detection, geometry: Mappi
     sigma = np.maximum(used.sigma_px.reshape(-1), MIN_SIGMA_PX)
     if not np.isfinite(pixels).all():
         return None
-    refined = [_refine(camera.K, points, pixels, sigma, T) for T in _starts(camera.K, points, pixels, sigma)]
+    starts = _starts(camera.K, points, pixels, _flat_parts(points, used.corners_px.shape[1]))
+    refined = [_refine(camera.K, points, pixels, sigma, T) for T in starts]
     candidates = _distinct([c for c in refined if c is not None])
     if not candidates:
         return None
-    return View(camera=camera.name, frame=frame, ids=tuple(map(int, used.ids)), candidates=candidates)
+    return View(
+        camera=camera.name, frame=frame, ids=tuple(map(int, used.ids)), n_corners=len(points), candidates=candidates
+    )
 
 
-def _starts(K: Array, points: Array, pixels: Array, sigma: Array) -> list[Pose]:
-    """Both planar solutions of every marker, and the general one, best first and without near twins."""
+def _flat_parts(points: Array, corners_each: int) -> list[slice]:
+    """Stretches of points (n, 3) that lie in one plane: every marker, and the whole of a flat target."""
+    markers = [slice(k, k + corners_each) for k in range(0, len(points), corners_each)] if corners_each >= 4 else []
+    _, spread, _ = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    flat = spread[2] < FLAT * spread[0] if len(points) > 3 else False
+    return markers + ([slice(0, len(points))] if flat and len(markers) != 1 else [])
+
+
+def _starts(K: Array, points: Array, pixels: Array, flat_parts: Sequence[slice]) -> list[Pose]:
+    """Both planar solutions of every flat part, and the general one, best first and without near twins."""
     found: list[Pose] = []
-    for k in range(0, len(points), 4):
-        found += _planar(K, points[k : k + 4], pixels[k : k + 4])
+    for part in flat_parts:
+        found += _planar(K, points[part], pixels[part])
     if len(points) > 4:
         found += _pnp(K, points, pixels, cv2.SOLVEPNP_SQPNP)
     in_front = [T for T in found if (points @ T[2, :3] + T[2, 3] > 0).all()]
@@ -133,20 +147,19 @@ def _starts(K: Array, points: Array, pixels: Array, sigma: Array) -> list[Pose]:
     return kept
 
 
-def _planar(K: Array, corners: Array, pixels: Array) -> list[Pose]:
-    """Both solutions of one marker."""
-    # In the marker's own plane: for some planes of the target's frame (z = 0.3 seen from +z) OpenCV 4.14's IPPE is
+def _planar(K: Array, points: Array, pixels: Array) -> list[Pose]:
+    """Both solutions of coplanar points."""
+    # In the plane's own frame: for some planes of the target's frame (z = 0.3 seen from +z) OpenCV 4.14's IPPE is
     # wrong by half a turn.
-    x, down = corners[1] - corners[0], corners[3] - corners[0]
-    z = np.cross(x, down)
-    if not np.linalg.norm(z) > 0:
+    middle = points.mean(axis=0)
+    _, spread, axes = np.linalg.svd(points - middle, full_matrices=False)
+    if spread[1] < FLAT * spread[0]:  # on a line, or all in one place
         return []
-    x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
-    R = np.array([x, np.cross(z, x), z], dtype=np.float64).T
-    T_target_marker = make_pose(R, corners.mean(axis=0))
-    T_marker_target = invert_transform(T_target_marker)
-    on_plane = transform_points(T_marker_target, corners) * [1.0, 1.0, 0.0]
-    return [T_cam_marker @ T_marker_target for T_cam_marker in _pnp(K, on_plane, pixels, cv2.SOLVEPNP_IPPE)]
+    axes[2] *= np.linalg.det(axes)
+    T_target_plane = make_pose(axes.T, middle)
+    T_plane_target = invert_transform(T_target_plane)
+    on_plane = transform_points(T_plane_target, points) * [1.0, 1.0, 0.0]
+    return [T_cam_plane @ T_plane_target for T_cam_plane in _pnp(K, on_plane, pixels, cv2.SOLVEPNP_IPPE)]
 
 
 def _pnp(K: Array, points: Array, pixels: Array, method: int) -> list[Pose]:
