@@ -1,0 +1,84 @@
+"""The health of a rig before it is solved: which cameras see the target together, and where that hangs by a thread.
+
+Owns      counts of shared frames, connected parts, the weakest link, a suggestion in words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+# A relative pose from fewer shared frames cannot be checked against itself.
+FEW_FRAMES = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeakestLink:
+    """The pair of cameras whose shared frames hold two groups of the rig together, and nothing else as well."""
+
+    i: str
+    j: str
+    frames: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraphHealth:
+    """Who sees the target together with whom."""
+
+    shared: Mapping[tuple[str, str], int]  # pairs with at least one frame in common
+    parts: tuple[tuple[str, ...], ...]  # groups of cameras that hang together, the largest first
+    weakest: WeakestLink | None  # of the best tree of the largest part; None for a single camera
+
+    @property
+    def suggestion(self) -> str:
+        """What to record to make the rig stronger; empty where nothing is needed."""
+        if len(self.parts) > 1:
+            one, other = self.parts[0], self.parts[1]
+            return (
+                f"cameras {_listed(one)} and {_listed(other)} never see the target together: put the target where "
+                f"{one[0]} and {other[0]}, or others of both groups, both see it"
+            )
+        if self.weakest is not None and self.weakest.frames < FEW_FRAMES:
+            return (
+                f"the rig hangs on {self.weakest.frames} shared frame{'s' * (self.weakest.frames > 1)} of cameras "
+                f"{self.weakest.i} and {self.weakest.j}: put the target where both see it"
+            )
+        return ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the file: pairs as a list."""
+        return {
+            "shared_frames": [{"cameras": [i, j], "frames": n} for (i, j), n in self.shared.items()],
+            "parts": [list(part) for part in self.parts],
+            "weakest_link": None
+            if self.weakest is None
+            else {"cameras": [self.weakest.i, self.weakest.j], "frames": self.weakest.frames},
+            "suggestion": self.suggestion,
+        }
+
+
+def _listed(names: Collection[str]) -> str:
+    return ", ".join(names)
+
+
+def graph_health(frames_of: Mapping[str, Collection[int]]) -> GraphHealth:
+    """Who sees the target together with whom.
+
+    Args:
+        frames_of: Camera -> frames in which it sees the target.
+    """
+    seen = {name: set(frames_of[name]) for name in sorted(frames_of)}
+    shared = {(i, j): n for i, j in combinations(seen, 2) if (n := len(seen[i] & seen[j]))}
+    part = {name: {name} for name in seen}
+    tree: list[WeakestLink] = []
+    # Kruskal from the strongest link on: the last one of a part is the strongest that its weakest place has.
+    for (i, j), n in sorted(shared.items(), key=lambda item: (-item[1], item[0])):
+        if part[i] is not part[j]:
+            merged = part[i] | part[j]
+            part.update(dict.fromkeys(merged, merged))
+            tree.append(WeakestLink(i=i, j=j, frames=n))
+    parts = sorted({tuple(sorted(names)) for names in part.values()}, key=lambda names: (-len(names), names))
+    in_largest = [link for link in tree if parts and link.i in parts[0]]
+    return GraphHealth(shared=shared, parts=tuple(parts), weakest=in_largest[-1] if in_largest else None)
