@@ -21,8 +21,10 @@ INCOMPLETE = 3  # exit code: poses were written, but not of every camera
                    "SVO files themselves cannot be read yet.")  # fmt: skip
 @click.option("-i", "--input", "inputs", type=click.Path(path_type=Path), multiple=True,
               help="A recording: an RGB-D folder of all cameras, or of one camera; repeatable.")  # fmt: skip
-@click.option("--markers", type=click.Path(path_type=Path), required=True,
-              help="Marker map of the target (parquet).")  # fmt: skip
+@click.option("--markers", type=click.Path(path_type=Path), help="Marker map of the target (parquet).")
+@click.option("--board", metavar="SPEC",
+              help="A board instead of a marker map: charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY, "
+                   "aprilgrid:COLUMNSxROWS:TAG_M:SPACING[:DICTIONARY[:FIRST_ID]], or a YAML file.")  # fmt: skip
 @click.option("--aruco-dictionary", default="DICT_APRILTAG_36h11", show_default=True,
               help="Any predefined OpenCV dictionary.")  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("extrinsics.json"), show_default=True,
@@ -30,6 +32,9 @@ INCOMPLETE = 3  # exit code: poses were written, but not of every camera
 @click.option("--moving-target/--resting-target", default=False, show_default=True,
               help="Whether the target is moved between frames. If it rests, its frame is the world; if it is moved, "
                    "the world is the target's frame at the first frame that two cameras see it in.")  # fmt: skip
+@click.option("--still", is_flag=True,
+              help="For cameras that are not synchronised: move the target and put it down now and then; the stretches "
+                   "in which it rests are used instead of single frames.")  # fmt: skip
 @click.option("--auto-align/--no-auto-align", default=False, show_default=True,
               help="Turn the world upright: +Y points up, against gravity. A level camera then has "
                    "T[:3,1] = [0,-1,0].")  # fmt: skip
@@ -66,6 +71,10 @@ def main(**given: Any) -> None:
         raise click.UsageError(
             "no recording given; pass --input PATH (or --svo PATH), as often as there are recordings"
         )
+    if bool(given["markers"]) == bool(given["board"]):
+        raise click.UsageError("give the target: --markers MAP.parquet, or --board SPEC, one of them")
+    if not given["auto_align"] and (given["ground_face"] or given["ground_marker_id"] or given["up_axis"] != "+y"):
+        click.echo("warning: --ground-face, --ground-marker-id and --up-axis do nothing without --auto-align", err=True)
     from rigcal import cli
 
     with cli.telling_errors(debug=given["debug"]):
@@ -75,16 +84,19 @@ def main(**given: Any) -> None:
 
 
 def _run(given: dict[str, Any]) -> Calibration:
+    from aruco.atomic import check_writable
     from rigcal import cli
     from rigcal.formats import native
     from rigcal.pipeline import calibrate_files
 
-    native.check_writable(given["output"])
+    cli.refuse_inputs(given["output"], [*given["svo"], *given["inputs"]], given["markers"])
+    check_writable(given["output"])
     with cli.showing_progress() as progress:
         calibration = calibrate_files(
             [*given["svo"], *given["inputs"]],
             given["markers"],
             _config(given),
+            board=given["board"],
             jobs=given["jobs"],
             progress=progress,
             preview=cli.preview_folder(given["output"]) if given["preview"] else None,
@@ -110,6 +122,7 @@ def _config(given: dict[str, Any]) -> CalibrateConfig:
             up_axis=given["up_axis"],
         ),
         moving_target=given["moving_target"],
+        still=given["still"],
         joint=given["joint"],
         seed=given["seed"],
     )

@@ -12,16 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from loguru import logger
 
 from aruco.errors import CalibrationError, InputError
 from aruco.marker_geometry import Face
+from aruco.model import UpAxis
 from aruco.pose_math import Array, Pose, make_pose, skew
-
-UpAxis = Literal["+y", "-y"]
 
 # The faces of the two shipped targets, for callers that have corners but no names. Their ids overlap.
 FACE_MARKER_MAP: dict[str, list[int]] = {

@@ -25,7 +25,7 @@ AGREE_SHARE = 0.08  # of the distance to the target
 # The winner must lead by more than one frame's opinion could be wrong by chance.
 MIN_LEAD = 0.5
 # Enough proposals to contain the truth many times over; all votes are still counted for each.
-MAX_PROPOSALS = 400
+MAX_PROPOSALS = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,8 +106,10 @@ def weight_of(view: View, candidate: Candidate, scale2: Mapping[str, float]) -> 
 
 def agreement(T_a: Pose, T_b: Pose, reach_m: Array) -> NDArray[np.bool_]:
     """Which of poses (m, 4, 4) and (n, 4, 4) agree, (m, n), for targets ``reach_m`` (n,) away."""
+    from scipy.spatial.distance import cdist
+
     trace = T_a[:, :3, :3].reshape(len(T_a), 9) @ T_b[:, :3, :3].reshape(len(T_b), 9).T
-    distance = np.linalg.norm(T_a[:, None, :3, 3] - T_b[None, :, :3, 3], axis=2)
+    distance = cdist(T_a[:, :3, 3], T_b[:, :3, 3])
     return (trace > 1 + 2 * np.cos(AGREE_RAD)) & (distance < AGREE_SHARE * reach_m)
 
 
@@ -120,15 +122,22 @@ def _elect(votes: Sequence[_Vote]) -> NDArray[np.bool_] | None:
     agree = agreement(T[proposals], T, reach / 2)
     # A frame counts once for a proposal, with its best fitting pair.
     _, frame = np.unique([vote.frame for vote in votes], return_inverse=True)
-    support = np.zeros((len(proposals), frame.max() + 1))
-    for vote in range(len(votes)):
-        support[:, frame[vote]] = np.maximum(support[:, frame[vote]], agree[:, vote] * weight[vote])
-    tally = support.sum(axis=1)
+    tally = _support(agree, weight, frame)
     best = int(np.argmax(tally))
+    # What speaks for the winner does not speak for a rival that lies just beyond its reach.
     rivals = ~agree[best, proposals]
-    if rivals.any() and tally[best] - tally[rivals].max() < MIN_LEAD:
+    others = _support(agree[rivals] & ~agree[best], weight, frame)
+    if len(others) and tally[best] - others.max() < MIN_LEAD:
         return None
     return agree[best]
+
+
+def _support(agree: NDArray[np.bool_], weight: Array, frame: NDArray[np.intp]) -> Array:
+    """For every proposal (p,) the sum over frames of the best weight among its votes; ``agree`` is (p, votes)."""
+    support = np.zeros((len(agree), int(frame.max()) + 1))
+    for vote in range(len(frame)):
+        support[:, frame[vote]] = np.maximum(support[:, frame[vote]], agree[:, vote] * weight[vote])
+    return support.sum(axis=1)
 
 
 def _one_per_frame(votes: Sequence[_Vote]) -> list[_Vote]:

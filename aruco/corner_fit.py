@@ -50,7 +50,8 @@ class CornerFit:
     corners_px: Array  # (n, 4, 2) recorded pixels
     sigma_px: Array  # (n, 4) standard deviation of a corner's coordinate
     misfit: Array  # (n,) residual of the worst edge, as a share of its contrast
-    shift_px: Array  # (n,) how far the farthest corner moved from its start
+    noise_grey: Array  # (n,) residual of the worst edge, in grey levels
+    shift_px: Array  # (n,) how far the farthest edge moved across itself from its start
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,30 +96,39 @@ def fit_corners(image: NDArray[np.uint8], quads_px: Array, cells: int, camera: C
         The corners; a marker that leaves the image or does not converge has an infinite misfit.
     """
     if not len(quads_px):
-        return CornerFit(corners_px=quads_px, sigma_px=np.empty((0, 4)), misfit=np.empty(0), shift_px=np.empty(0))
-    corners = _straighten(camera, quads_px)
+        none = np.empty(0)
+        return CornerFit(corners_px=quads_px, sigma_px=np.empty((0, 4)), misfit=none, noise_grey=none, shift_px=none)
+    start = _straighten(camera, quads_px)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        corners, _, _ = _measure(image, corners, cells, camera, FIND)
-        corners, variance, misfit = _measure(image, corners, cells, camera, MEASURE)
+        corners, _, _, _ = _measure(image, start, cells, camera, FIND)
+        corners, variance, misfit, noise = _measure(image, corners, cells, camera, MEASURE)
+        shift = _across(start, corners)
     bent = _bend(camera, corners)
-    shift = np.linalg.norm(bent - quads_px, axis=2).max(axis=1)
-    lost = ~np.isfinite(shift + misfit + variance.sum(axis=1))
-    misfit[lost] = np.inf
+    lost = ~np.isfinite(shift + misfit + variance.sum(axis=1) + bent.sum(axis=(1, 2)))
+    misfit[lost] = shift[lost] = np.inf
     sigma = np.sqrt(variance + SIGMA_FLOOR_PX**2)
-    return CornerFit(corners_px=bent, sigma_px=sigma, misfit=misfit, shift_px=shift)
+    return CornerFit(corners_px=bent, sigma_px=sigma, misfit=misfit, noise_grey=noise, shift_px=shift)
+
+
+def _across(start: Array, refined: Array) -> Array:
+    """How far the middle of the farthest edge moved across itself (n,): corners of oblique markers move farther."""
+    edges = _edges(start)
+    middle = (refined + np.roll(refined, -1, axis=1)).reshape(-1, 2) / 2
+    return np.abs(np.einsum("ei,ei->e", middle - edges.middle, edges.out)).reshape(-1, 4).max(axis=1)
 
 
 def _measure(
     image: NDArray[np.uint8], corners: Array, cells: int, camera: Camera | None, how: _Pass
-) -> tuple[Array, Array, Array]:
-    """One round: corners (n, 4, 2) in the pinhole image, their variance (n, 4), the misfit (n,) of the worst edge."""
+) -> tuple[Array, Array, Array, Array]:
+    """One round: corners (n, 4, 2) in the pinhole image, their variance (n, 4), misfit and noise of the worst edge."""
     side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min(axis=1)
     usable = np.isfinite(corners).all(axis=(1, 2)) & (side >= MIN_SIDE_PX)
     edges = _edges(np.where(usable[:, None, None], corners, _STAND_IN))
     lines = _fit_steps(_Band(image, edges, cells, camera, how), how)
     refined, variance = _intersect(edges, lines)
     refined[~usable] = np.nan
-    return refined, variance, lines.misfit.reshape(-1, 4).max(axis=1)
+    worst = [values.reshape(-1, 4).max(axis=1) for values in (lines.noise / lines.contrast, lines.noise)]
+    return refined, variance, worst[0], worst[1]
 
 
 def _straighten(camera: Camera | None, points: Array) -> Array:
@@ -195,12 +205,13 @@ def _local_lens(camera: Camera | None, line: Array) -> tuple[Array, Array]:
 
 @dataclass(slots=True)
 class _Lines:
-    """Fitted edges: true line at ``x0 = offset + slope * t``, their (E, 2, 2) covariance, misfit (E,)."""
+    """Fitted edges: true line at ``x0 = offset + slope * t``, their (E, 2, 2) covariance, noise and contrast [grey]."""
 
     offset: Array
     slope: Array
     covariance: Array
-    misfit: Array
+    noise: Array
+    contrast: Array
 
 
 def _fit_steps(band: _Band, how: _Pass) -> _Lines:
@@ -218,7 +229,7 @@ def _fit_steps(band: _Band, how: _Pass) -> _Lines:
         theta[:, 2] = np.clip(theta[:, 2], BLUR_MIN_PX, BLUR_MAX_PX)
     covariance = noise[:, None, None] ** 2 * _inverse(H)[:, :2, :2]
     contrast = np.maximum(np.abs(theta[:, 5] - theta[:, 3]), 1e-9)
-    return _Lines(theta[:, 0], theta[:, 1], covariance, noise / contrast)
+    return _Lines(theta[:, 0], theta[:, 1], covariance, noise, contrast)
 
 
 def _normal_equations(band: _Band, theta: Array) -> tuple[Array, Array, Array]:

@@ -21,7 +21,9 @@ DEFAULT_DICTIONARY = "DICT_APRILTAG_36h11"
 # Residual of an edge as a share of its contrast: clean and noisy edges stay below 0.1; an occluded edge, one that
 # belongs to something else, or a smeared one does not.
 MAX_MISFIT = 0.2
-# A fit that wanders farther than plain ArUco is ever wrong has found another edge.
+# ... unless the residual is what the pixels' own noise makes.
+NOISE_ALLOWANCE = 1.5
+# An edge that wanders farther across itself than plain ArUco's are ever wrong is another edge.
 MAX_SHIFT_PX = 3.0
 MAX_SHIFT_SHARE = 0.05  # of the marker's shortest side, for large blurred markers
 # Cells below this are too small for an edge fit to be trusted or blamed: such a marker keeps its plain corners.
@@ -89,7 +91,10 @@ class MarkerDetector:
             return Detection(ids=ids, corners_px=quads, sigma_px=np.empty((0, 4)))
         fit = fit_corners(grey, quads, self._dictionary.cells, camera)
         side = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).min(axis=1)
-        good = (fit.misfit <= MAX_MISFIT) & (fit.shift_px <= np.maximum(MAX_SHIFT_PX, MAX_SHIFT_SHARE * side))
+        clean = fit.misfit <= MAX_MISFIT
+        if not clean.all():  # a dim marker in a noisy image has a large misfit for no fault of its own
+            clean |= np.isfinite(fit.misfit) & (fit.noise_grey <= NOISE_ALLOWANCE * _pixel_noise(grey))
+        good = clean & (fit.shift_px <= np.maximum(MAX_SHIFT_PX, MAX_SHIFT_SHARE * side))
         small = side / self._dictionary.cells < SMALL_CELL_PX
         corners = np.where(good[:, None, None], fit.corners_px, quads)
         sigma = np.where(good[:, None], fit.sigma_px, PLAIN_SIGMA_PX)
@@ -133,6 +138,13 @@ def diagnose_dictionaries(images: Sequence[NDArray[np.uint8]], known_ids: Collec
     named = {name: n for name, n in counts.items() if n and n >= best / 4}
     # Among equals the smallest dictionary first: it was meant, or finds the same with less noise.
     return dict(sorted(named.items(), key=lambda item: -item[1]))
+
+
+def _pixel_noise(grey: NDArray[np.uint8]) -> float:
+    """Standard deviation of an image's pixel noise [grey levels] (Immerkaer 1996, with a median against texture)."""
+    kernel = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+    differences = cv2.filter2D(grey, cv2.CV_32F, kernel)
+    return float(np.median(np.abs(differences))) / (0.6745 * 6.0)
 
 
 def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

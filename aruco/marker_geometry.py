@@ -10,7 +10,6 @@ ArUco's order (top left, top right, bottom right, bottom left, looking at the pr
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from aruco.errors import InputError, OutputError
+from aruco.atomic import write_whole
+from aruco.errors import InputError
 from aruco.pose_math import Array
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ MAX_SIDE_MISMATCH = 0.05  # longest side over shortest, minus one
 MAX_CORNER_MISMATCH = 0.05  # cosine between neighbouring sides
 MIN_SIDE_M = 1e-3
 MAX_COORDINATE_M = 100.0
+MAX_ID = 2**31 - 1
 # Millions of numbers are a wrong file, not a target; a small file can unpack to more than fits in memory.
 MAX_FILE_BYTES = 64 * 2**20
 MAX_VALUES = 10_000_000
@@ -121,8 +122,8 @@ def _checked_face(row: Mapping[str, Any], where: str) -> Face:
     if not isinstance(name, str) or not name:
         raise InputError(f"{where}: the face has no name; give it one.")
     where = f"{where} (face {name})"
-    if not isinstance(ids, list) or not all(type(i) is int and i >= 0 for i in ids):
-        raise InputError(f"{where}: ids must be a list of whole numbers from 0, got {ids!r:.80}.")
+    if not isinstance(ids, list) or not all(type(i) is int and 0 <= i <= MAX_ID for i in ids):
+        raise InputError(f"{where}: ids must be a list of whole numbers from 0 to {MAX_ID}, got {ids!r:.80}.")
     try:
         corners: Array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -187,17 +188,12 @@ def save_faces(path: str | os.PathLike[str], faces: Sequence[Face]) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        pq.write_table(_table(faces), part)
-        part.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another place.") from error
+    buffer = pa.BufferOutputStream()
+    pq.write_table(_table(faces), buffer)
+    write_whole(Path(path), buffer.getvalue().to_pybytes())
 
 
 def _table(faces: Sequence[Face]) -> pa.Table:

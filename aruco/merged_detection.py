@@ -44,6 +44,8 @@ def frames_at_rest(detections: Mapping[int, Detection]) -> list[int]:
 
 
 def _rests(detection: Detection, median: Mapping[int, Array]) -> bool:
+    if not len(detection):
+        return False
     usual = np.array([median[int(marker)] for marker in detection.ids])
     size = np.ptp(usual, axis=1).max(axis=1)
     away = np.linalg.norm(detection.corners_px - usual, axis=2).mean(axis=1)
@@ -82,9 +84,11 @@ def _mean(seen: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     promised = sigma.mean(axis=1)
     limit = OUTLIER_SIGMAS * np.maximum(np.median(distance) / RAYLEIGH_MEDIAN, promised)
     good = distance.max(axis=1) <= limit
+    agreed = bool(good.any())  # or half of the frames say one thing and half another
+    good |= not agreed
     corners, sigma = corners[good], sigma[good]
     n = len(corners)
     noise2 = np.maximum(sigma**2 - SIGMA_FLOOR_PX**2, 0.0).mean(axis=0)
-    if n > 2:  # two frames say too little about their scatter
+    if n > 2 or not agreed:  # two frames that agree say too little about their scatter
         noise2 = np.maximum(noise2, corners.var(axis=0, ddof=1).mean())
     return corners.mean(axis=0), np.sqrt(noise2 / n + SIGMA_FLOOR_PX**2)

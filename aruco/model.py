@@ -68,6 +68,8 @@ class Camera:
     def __post_init__(self) -> None:
         """Check every field; see InputError's message for what is wrong."""
         who = f"camera {self.name}"
+        if not self.name or self.name.startswith("_"):
+            raise InputError(f"{who}: names that start with _ are no cameras in extrinsics files; rename its folder.")
         if not (0 < self.width <= MAX_IMAGE_SIDE_PX and 0 < self.height <= MAX_IMAGE_SIDE_PX):
             raise InputError(f"{who}: image size {self.width} x {self.height} is not a camera's.")
         object.__setattr__(self, "K", _checked_intrinsics(self.K, f"{who}: camera_matrix"))

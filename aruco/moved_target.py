@@ -19,6 +19,9 @@ from aruco.pose_math import Pose, adjoint, invert_transform, pose_distance
 from aruco.rig_estimate import Placement, RigEstimate
 from aruco.view_pose import Candidate, View
 
+# A link that rests on one or two frames cannot check itself: others go first, however sharp its corners are.
+ENOUGH_FRAMES = 3
+
 # camera -> the solution that the rig agrees on, for every frame
 Chosen = Mapping[int, Mapping[str, Candidate]]
 
@@ -58,7 +61,11 @@ def _best_tree(cameras: Iterable[str], links: Sequence[CameraLink]) -> list[Came
     """The strongest spanning tree of the largest connected part (Kruskal): its links, strongest first."""
     part = {name: {name} for name in cameras}
     tree: list[CameraLink] = []
-    for link in sorted(links, key=lambda link: (-link.strength, link.i, link.j)):
+
+    def order(link: CameraLink) -> tuple[int, float, str, str]:
+        return -min(len(link.frames), ENOUGH_FRAMES), -link.strength, link.i, link.j
+
+    for link in sorted(links, key=order):
         if part[link.i] is not part[link.j]:
             merged = part[link.i] | part[link.j]
             for name in merged:

@@ -188,3 +188,8 @@ def rotation_angle(R: Array) -> float:
 def pose_distance(T_a: Pose, T_b: Pose) -> tuple[float, float]:
     """Angle [rad] and distance of origins [m] between two poses given in one frame."""
     return rotation_angle(T_a[:3, :3].T @ T_b[:3, :3]), float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]))
+
+
+def pose_text(T: Pose) -> str:
+    """The sixteen numbers of a pose, row by row; each reads back as the same float64."""
+    return " ".join(repr(float(number) + 0.0) for number in T.ravel())

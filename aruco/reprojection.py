@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aruco import lens
 from aruco.model import Camera, Detection
@@ -22,11 +23,18 @@ class Reprojection:
     """Pixel errors of one camera: where the rig puts each corner minus where it was seen."""
 
     errors_px: Array  # (n, 2)
+    markers: NDArray[np.int64]  # (n,) the marker that each corner belongs to
 
     @property
     def rms_px(self) -> float:
         """Root mean square over corners of the distance, both coordinates together."""
         return float(np.sqrt(np.mean(np.sum(self.errors_px**2, axis=1))))
+
+    def worst_markers(self, count: int) -> list[int]:
+        """The markers whose corners are farthest off, by their median, the worst first."""
+        distance = np.linalg.norm(self.errors_px, axis=1)
+        medians = {int(m): float(np.median(distance[self.markers == m])) for m in np.unique(self.markers)}
+        return sorted(medians, key=lambda marker: -medians[marker])[:count]
 
 
 def reproject(
@@ -46,10 +54,11 @@ def reproject(
     result: dict[str, Reprojection] = {}
     for name, by_frame in detections.items():
         T_cam_world = invert_transform(rig.cameras[name].T_world_cam)
-        errors = [np.empty((0, 2))]
+        errors, markers = [np.empty((0, 2))], [np.empty(0, np.int64)]
         for frame, detection in by_frame.items():
             points = np.concatenate([geometry[int(i)] for i in detection.ids])
             in_camera = transform_points(T_cam_world @ rig.T_world_target[frame], points)
             errors.append(lens.project(cameras[name], in_camera) - detection.corners_px.reshape(-1, 2))
-        result[name] = Reprojection(np.concatenate(errors))
+            markers.append(np.repeat(detection.ids, detection.sigma_px.shape[1]))
+        result[name] = Reprojection(np.concatenate(errors), np.concatenate(markers))
     return result

@@ -17,9 +17,10 @@ from aruco.model import Recording
 from aruco.pose_math import Array, Pose
 from benchmarks.metric import Metric
 from rigcal.config import AlignConfig, CalibrateConfig, DetectConfig
-from rigcal.pipeline import Target, calibrate
+from rigcal.pipeline import calibrate
 from rigcal.quality.truth import pair_errors, tilt_error
 from rigcal.sim import Simulation
+from rigcal.target import marker_target
 
 UP = (0, 1, 0)
 
@@ -67,7 +68,7 @@ def measure_rigs(rigs: Iterable[MeasuredRig]) -> RigErrors:
     for rig in rigs:
         asked += len(rig.T_world_cam)
         try:
-            result = calibrate(rig.recording, Target(faces=rig.faces), rig.config)
+            result = calibrate(rig.recording, marker_target(rig.faces, rig.config.detect.dictionary), rig.config)
         except CalibrationError:
             continue  # none of its cameras count as placed
         placed += len(result.cameras)

@@ -44,7 +44,7 @@ def demo(**given: Any) -> None:
 def simulate(**given: Any) -> None:
     """Render the rig NAME into the folder OUT: a recording, its marker map, and the truth.
 
-    Rigs: box-static, box-moved, corner-static, demo, hd.
+    Rigs: box-static, box-moved, corner-static, board-moved, demo, hd.
     """
     from rigcal import cli, stories
 

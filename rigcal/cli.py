@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import click
 from loguru import logger
 
-from aruco.errors import RigError
+from aruco.errors import OutputError, RigError
 from aruco.model import Calibration
 from rigcal.report.progress import showing_progress
 from rigcal.report.terminal import console, show_calibration
@@ -21,6 +22,9 @@ __all__ = ["preview_folder", "showing_progress", "tell", "telling_errors"]
 @contextmanager
 def telling_errors(*, debug: bool) -> Iterator[None]:
     """Log to stderr; an error the user can cure becomes one sentence and exit code 1, anything else stays a bug."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a name must not end the run
+            stream.reconfigure(errors="backslashreplace")
     logger.remove()
     style = "<level>{level: <7}</level> {message}" if not debug else "{time:HH:mm:ss.SSS} {level: <7} {name}: {message}"
     logger.add(sys.stderr, level="DEBUG" if debug else "INFO", format=style)
@@ -29,7 +33,25 @@ def telling_errors(*, debug: bool) -> Iterator[None]:
     except RigError as error:
         raise click.ClickException(str(error)) from error
     except KeyboardInterrupt:
-        raise click.ClickException("interrupted; nothing was written.") from None
+        raise click.ClickException("interrupted.") from None
+
+
+def refuse_inputs(output: Path, recordings: Sequence[Path], markers: Path | None) -> None:
+    """An output must not replace what it is made from.
+
+    Raises:
+        OutputError: It is the marker map, or lies inside a camera's folder.
+    """
+    goal = output.resolve()
+    if markers is not None and goal == markers.resolve():
+        raise OutputError(f"{output}: is the marker map, an input; give --output another name.")
+    if goal.exists() and any(goal == path.resolve() for path in recordings):
+        raise OutputError(f"{output}: is a recording, an input; give --output another name.")
+    for path in recordings:
+        root = path.resolve()
+        for folder in goal.parents:
+            if (folder == root or root in folder.parents) and (folder / "camera_info.yaml").exists():
+                raise OutputError(f"{output}: lies in the camera folder {folder.name}, an input; choose another place.")
 
 
 def preview_folder(output: Path) -> Path:

@@ -9,7 +9,10 @@ import os
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from aruco.errors import InputError
 from aruco.model import UpAxis
+
+MAX_TOLERANCE_MS = 3_600_000.0  # frames an hour apart are no moment
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,6 +22,13 @@ class FrameConfig:
     sync_tolerance_ms: float | None = None  # None: half the slowest camera's frame period, at most 100 ms
     sample_interval: int = 1  # every Nth synchronised frame
     max_samples: int | None = None  # at most so many of these, spread over the recording
+
+    def __post_init__(self) -> None:
+        """Refuse a tolerance that is no time."""
+        if self.sync_tolerance_ms is not None and not 0 <= self.sync_tolerance_ms < MAX_TOLERANCE_MS:
+            raise InputError(
+                f"--sync-tolerance-ms {self.sync_tolerance_ms:g}: want milliseconds from 0 to {MAX_TOLERANCE_MS:g}."
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +57,7 @@ class CalibrateConfig:
     detect: DetectConfig = field(default_factory=DetectConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     moving_target: bool = False
+    still: bool = False  # use the stretches in which the target rests instead of single frames
     joint: bool = True  # adjust all cameras and frames together after the average
     seed: int = 0
 

@@ -16,13 +16,12 @@ from dataclasses import dataclass
 
 import cv2
 from loguru import logger
-from numpy.typing import NDArray
 
-from aruco.detector import MarkerDetector
 from aruco.model import BadFrame, Camera, Detection, Frame, FrameCounts, Progress, Recording
-from aruco.pose_math import Array
 from aruco.svo_sync import SyncResult
 from aruco.view_pose import View, solve_view
+from rigcal.frames import Moments
+from rigcal.target import Target
 
 # Called with every image that was read; for previews.
 OnFrame = Callable[[Frame, Camera, Detection, View | None], None]
@@ -35,6 +34,7 @@ class Seen:
     views: tuple[View, ...]
     detections: Mapping[int, Detection]  # frame -> markers of the target
     digests: tuple[str, ...]  # of every image read, in time order
+    stamps_ns: tuple[int, ...]
     counts: FrameCounts
     first_bad: str = ""  # why the first unreadable frame could not be read
 
@@ -54,6 +54,7 @@ class _Outcome:
 
     frame: int
     digest: str = ""
+    stamp_ns: int = 0
     bad: str = ""  # why it could not be read
     detection: Detection | None = None
     view: View | None = None
@@ -61,10 +62,8 @@ class _Outcome:
 
 def watch(
     recording: Recording,
-    sync: SyncResult,
-    groups: NDArray,
-    detector: MarkerDetector,
-    geometry: Mapping[int, Array],
+    moments: Moments,
+    target: Target,
     *,
     min_markers: int,
     jobs: int,
@@ -75,10 +74,8 @@ def watch(
 
     Args:
         recording: The images.
-        sync: Which frames belong together; its columns name the cameras.
-        groups: (n, n_cameras) the chosen rows of ``sync.groups``.
-        detector: For the target's dictionary and ids.
-        geometry: Marker id -> (4, 3) corners [m], target frame.
+        moments: The frames to look at.
+        target: What to look for.
         min_markers: A view with fewer is left out.
         jobs: Threads; the result does not depend on it.
         progress: Is told of every image.
@@ -88,19 +85,26 @@ def watch(
         Camera -> what was seen, for every camera of the recording.
     """
     by_name = {camera.name: camera for camera in recording.cameras}
-    chosen = {name: [(f, int(k)) for f, k in enumerate(groups[:, c]) if k >= 0] for c, name in enumerate(sync.cameras)}
+    columns = moments.sync.cameras
+    chosen = {
+        name: [(f, int(k)) for f, k in enumerate(moments.groups[:, c]) if k >= 0] for c, name in enumerate(columns)
+    }
     tasks = [task for name, pairs in chosen.items() for task in _tasks(by_name[name], pairs, jobs, len(chosen))]
     counter = _Counter(progress, sum(len(task.frames) for task in tasks))
 
     def run(task: _Task) -> list[_Outcome]:
-        return list(_search(recording, task, detector, geometry, min_markers, counter, on_frame))
+        return list(_search(recording, task, target, min_markers, counter, on_frame))
 
     with _one_thread_each(jobs), ThreadPoolExecutor(max_workers=max(jobs, 1)) as pool:
-        results = list(pool.map(run, tasks))
+        try:
+            results = list(pool.map(run, tasks))
+        except BaseException:  # an interrupt or a full disk: the other threads must not search to the end
+            counter.stopped = True
+            raise
     found: dict[str, list[_Outcome]] = {name: [] for name in by_name}
     for task, result in zip(tasks, results):
         found[task.camera.name] += result
-    return {name: _summary(name, found[name], recording, sync) for name in by_name}
+    return {name: _summary(name, found[name], recording, moments.sync) for name in by_name}
 
 
 class _one_thread_each:  # noqa: N801 (a context manager reads like a verb)
@@ -118,11 +122,12 @@ class _one_thread_each:  # noqa: N801 (a context manager reads like a verb)
 
 
 class _Counter:
-    """Counts finished images over threads."""
+    """Counts finished images over threads, and tells them when to stop."""
 
     def __init__(self, progress: Progress, total: int) -> None:
         self._progress, self._total, self._done = progress, total, 0
         self._lock = threading.Lock()
+        self.stopped = False
 
     def tick(self) -> None:
         with self._lock:
@@ -142,8 +147,7 @@ def _tasks(camera: Camera, pairs: Sequence[tuple[int, int]], jobs: int, n_camera
 def _search(
     recording: Recording,
     task: _Task,
-    detector: MarkerDetector,
-    geometry: Mapping[int, Array],
+    target: Target,
     min_markers: int,
     counter: _Counter,
     on_frame: OnFrame | None,
@@ -153,13 +157,15 @@ def _search(
             logger.debug("camera {}: frame left out: {}", task.camera.name, frame.reason)
             yield _Outcome(frame=index, bad=frame.reason)
         else:
-            detection = detector.detect(frame.image, task.camera)
+            detection = target.detector.detect(frame.image, task.camera)
             enough = len(detection) >= max(min_markers, 1)
-            view = solve_view(task.camera, index, detection, geometry) if enough else None
+            view = solve_view(task.camera, index, detection, target.geometry) if enough else None
             if on_frame is not None:
                 on_frame(frame, task.camera, detection, view)
-            yield _Outcome(frame=index, digest=frame.digest, detection=detection, view=view)
+            yield _Outcome(frame=index, digest=frame.digest, stamp_ns=frame.stamp_ns, detection=detection, view=view)
         counter.tick()
+        if counter.stopped:
+            return
 
 
 def _summary(name: str, found: Sequence[_Outcome], recording: Recording, sync: SyncResult) -> Seen:
@@ -176,16 +182,16 @@ def _summary(name: str, found: Sequence[_Outcome], recording: Recording, sync: S
         views=tuple(outcome.view for outcome in found if outcome.view is not None),
         detections=detections,
         digests=tuple(outcome.digest for outcome in found if not outcome.bad),
+        stamps_ns=tuple(outcome.stamp_ns for outcome in found if not outcome.bad),
         counts=counts,
         first_bad=bad[0] if bad else "",
     )
 
 
 def digest_of(seen: Seen, camera: Camera) -> str:
-    """SHA-256 over a camera's intrinsics and the bytes of every image that was read."""
+    """SHA-256 over a camera's intrinsics and the stamps and bytes of every image that was read."""
     sha = hashlib.sha256()
     sha.update(repr((camera.width, camera.height, camera.distortion_model)).encode())
     sha.update(camera.K.tobytes() + camera.distortion.tobytes())
-    for digest in seen.digests:
-        sha.update(digest.encode())
+    sha.update(repr((seen.stamps_ns, seen.digests)).encode())
     return sha.hexdigest()

@@ -5,32 +5,39 @@ Owns      the sentences, and the looking that they need.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 
+import numpy as np
 from numpy.typing import NDArray
 
 from aruco.detector import MarkerDetector, diagnose_dictionaries
 from aruco.errors import CalibrationError, InputError
-from aruco.model import Frame, Recording
+from aruco.model import Camera, Frame, Recording
 from aruco.pose_math import Array
 from aruco.reprojection import Reprojection
-from aruco.rig_estimate import Placement
+from aruco.rig_estimate import Placement, RigEstimate
 from aruco.svo_sync import SyncResult
 from rigcal.config import DetectConfig
 from rigcal.detecting import Seen
+from rigcal.target import Target
 
 # Enough to see a marker if there is one, few enough to try two dozen dictionaries on.
 FRAMES_TO_TRY = 3
 CAMERAS_TO_TRY = 4
 # Well calibrated intrinsics and a true map stay far below.
 DOUBTFUL_RMS_PX = 1.5
+# Beyond this a pose is no pose: a wrong map or somebody else's intrinsics.
+MISFIT_PX, MISFIT_SHARE = 5.0, 0.005  # px, or a share of the image's width
+# Rooms are smaller, markers in them neither as small nor as large.
+FAR_M = 30.0
+ROLLED_DEG = 30.0
 MIN_USED_SHARE = 0.7
 
 
-def require_views(
-    recording: Recording, geometry: Mapping[int, Array], config: DetectConfig, seen: Mapping[str, Seen]
-) -> None:
+def require_views(recording: Recording, target: Target, config: DetectConfig, seen: Mapping[str, Seen]) -> None:
     """Go on only if at least one view shows the target.
 
     Raises:
@@ -53,6 +60,9 @@ def require_views(
         raise CalibrationError(
             f"No image shows {config.min_markers} markers of the map at once, at most {most}; lower --min-markers."
         )
+    if not target.dictionary:
+        raise CalibrationError(_no_board(target, images))
+    geometry = target.geometry
     strangers = _ids_in(images, config.dictionary)
     if strangers:
         raise CalibrationError(
@@ -68,6 +78,25 @@ def require_views(
     raise CalibrationError(
         f"No marker of any dictionary was found in the first frames (ids of the map: {_listed(geometry)}); check that "
         "the target is in view, sharp, and larger than about 15 pixels."
+    )
+
+
+def _no_board(target: Target, images: list[NDArray]) -> str:
+    from aruco.board_detector import BoardDetector
+
+    if isinstance(target.detector, BoardDetector) and any(target.detector.mirrored(image) for image in images):
+        return (
+            "The board shows only in the mirrored image: it is seen in a mirror, or the recording is flipped; record "
+            "the board itself, and switch off mirroring in the camera's settings."
+        )
+    if isinstance(target.detector, BoardDetector) and any(target.detector.misplaced(image) for image in images):
+        return (
+            "Markers of the board are seen, but not where --board puts them: are columns and rows exchanged, is the "
+            "print of OpenCV's older pattern (legacy_pattern in a YAML file), or is it another board?"
+        )
+    return (
+        "No corner of the board was found in any image; check --board (columns x rows, sizes, dictionary), and that "
+        "the board is in view and sharp."
     )
 
 
@@ -115,8 +144,42 @@ def cameras_without_views(recording: Recording, sync: SyncResult, seen: Mapping[
     return reasons
 
 
-def warnings(placement: Placement, residuals: Reprojection, seen: Seen) -> Iterator[str]:
-    """What a user should know about one camera of the result."""
+def refuse_misfits(rig: RigEstimate, residuals: Mapping[str, Reprojection], cameras: Sequence[Camera]) -> RigEstimate:
+    """The rig without cameras whose corners lie so far from where they should that the pose means nothing.
+
+    Raises:
+        CalibrationError: None is left.
+    """
+    width = {camera.name: camera.width for camera in cameras}
+    refused = {
+        name: (
+            f"the corners lie {r.rms_px:.0f} px (RMS) from where the marker map puts them, farthest those of "
+            f"{_worst(r)}: check that map (ids, corner order, sizes) and intrinsics are this target's and camera's"
+        )
+        for name, r in residuals.items()
+        if not r.rms_px <= max(MISFIT_PX, MISFIT_SHARE * width[name])
+    }
+    if len(refused) == len(rig.cameras):
+        name, reason = next(iter(refused.items()))
+        raise CalibrationError(f"No camera fits: camera {name}: {reason}.")
+    kept = {name: placement for name, placement in rig.cameras.items() if name not in refused}
+    return replace(rig, cameras=kept, lost={**rig.lost, **refused})
+
+
+def _worst(residuals: Reprojection) -> str:
+    return ", ".join(str(marker) for marker in residuals.worst_markers(3))
+
+
+def warnings(placement: Placement, residuals: Reprojection, seen: Seen, up: Array | None) -> Iterator[str]:
+    """What a user should know about one camera of the result; ``up`` (3,) in its world, None where it is unknown."""
+    reach = float(np.median([np.linalg.norm(view.best.T_cam_target[:3, 3]) for view in seen.views]))
+    if reach > FAR_M:
+        yield f"stands {reach:.0f} m from the target: are the sizes in the marker map metres?"
+    if up is not None:
+        x, y = (float(axis @ up) for axis in placement.T_world_cam[:3, :2].T)
+        roll_deg = math.degrees(math.atan2(abs(x), -y))
+        if roll_deg > ROLLED_DEG and math.hypot(x, y) > 0.2:
+            yield f"is rolled by {roll_deg:.0f} degrees: mounted sideways or upside down, or the world is not upright"
     left_out = placement.n_views - len(placement.frames)
     if seen.counts.bad:
         yield f"{seen.counts.bad} unreadable frames left out ({seen.first_bad})"

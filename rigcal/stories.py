@@ -5,7 +5,9 @@ from __future__ import annotations
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
+from shlex import quote
 
+from aruco.board import board_text
 from aruco.errors import OutputError
 from aruco.marker_geometry import save_faces
 from rigcal import cli
@@ -43,10 +45,15 @@ def simulate_files(
     )
     _write(simulation, out)
     moving = " --moving-target" if simulation.rig.moving else ""
+    board = simulation.target.board
+    target = (
+        f"--board {board_text(board)}"
+        if board is not None
+        else f"--markers {quote(str(out / MARKER_MAP))} --aruco-dictionary {simulation.dictionary}"
+    )
     console().print(
         f"Wrote {out}: {len(simulation.recording.cameras)} cameras, the marker map {MARKER_MAP}, and {TRUTH}.\n"
-        f"Calibrate it with: calibrate-extrinsics --input {out} --markers {out / MARKER_MAP} "
-        f"--aruco-dictionary {simulation.dictionary}{moving} --auto-align",
+        f"Calibrate it with: calibrate-extrinsics --input {quote(str(out))} {target}{moving} --auto-align",
         markup=False,
     )
 

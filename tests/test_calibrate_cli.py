@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from calibrate_extrinsics import main
 from rigcal.formats.native import read_poses
 from rigcal.quality.truth import pair_errors, tilt_error
 from rigcal.sim import Simulation
+from rigcal.sources.camera_info import load_camera_info
 
 BOX = SHIPPED_MAPS / "standard_box_markers.parquet"
 
@@ -273,8 +275,43 @@ def test_unknown_faces_and_markers_are_answered_with_the_known_ones(demo_folder:
 
 
 def test_outputs_that_cannot_be_written(demo_folder: Path, tmp_path: Path) -> None:
-    assert_one_sentence(calibrate(demo_folder, tmp_path / "no" / "out.json"), "does not exist", "--output")
-    assert_one_sentence(calibrate(demo_folder, tmp_path), "folder", "--output")
+    assert_one_sentence(calibrate(demo_folder, tmp_path / "no" / "out.json"), "does not exist")
+    assert_one_sentence(calibrate(demo_folder, tmp_path), "folder")
+
+
+def test_inputs_are_never_overwritten(copy: Path, tmp_path: Path) -> None:
+    markers = tmp_path / "map.parquet"
+    shutil.copy(BOX, markers)
+    info = next(copy.rglob("camera_info.yaml"))
+    for target in (markers, info, copy / "41000001" / "new.json"):
+        assert_one_sentence(calibrate(copy, target, markers=markers), "input")
+    assert markers.read_bytes() == BOX.read_bytes()
+    assert load_camera_info(info, "x").width == 640
+
+
+def test_a_link_stays_a_link_and_a_pipe_a_pipe(demo_folder: Path, tmp_path: Path) -> None:
+    link, pipe = tmp_path / "link.json", tmp_path / "pipe"
+    link.symlink_to(tmp_path / "goal.json")
+    assert calibrate(demo_folder, link).exit_code == 0
+    assert link.is_symlink()
+    assert len(read_poses(tmp_path / "goal.json")) == 4
+    os.mkfifo(pipe)
+    assert_one_sentence(calibrate(demo_folder, pipe), "pipe")
+
+
+def test_a_map_that_fits_no_image_is_refused(demo_folder: Path, tmp_path: Path) -> None:
+    def swapped(rows: list[dict]) -> None:
+        rows[2]["ids"], rows[3]["ids"] = rows[3]["ids"], rows[2]["ids"]
+
+    result = calibrate(demo_folder, tmp_path / "out.json", "--auto-align", markers=damaged_map(tmp_path, swapped))
+    assert result.exit_code in (1, 3)
+    assert "marker map" in result.output
+    assert "Traceback" not in result.output
+
+
+def test_a_camera_named_like_the_files_own_entries_is_refused(copy: Path, tmp_path: Path) -> None:
+    (copy / "41000001").rename(copy / "_meta")
+    assert_one_sentence(calibrate(copy, tmp_path / "out.json"), "_meta", "rename")
 
 
 def test_wrong_usage_is_exit_code_2(demo_folder: Path, tmp_path: Path) -> None:

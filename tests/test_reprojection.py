@@ -101,4 +101,4 @@ def test_a_camera_that_stands_a_centimetre_aside_is_seen_in_pixels() -> None:
 
 
 def test_rms_counts_corners_not_coordinates() -> None:
-    assert Reprojection(np.array([[3.0, 4.0], [0.0, 0.0]])).rms_px == pytest.approx(np.sqrt(12.5))
+    assert Reprojection(np.array([[3.0, 4.0], [0.0, 0.0]]), np.array([7, 8])).rms_px == pytest.approx(np.sqrt(12.5))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from aruco import lens
+from aruco.board import CharucoBoard, board_geometry, parse_board
 from aruco.errors import InputError
 from aruco.marker_geometry import SHIPPED_MAPS, load_faces
 from aruco.model import Camera
@@ -38,6 +39,7 @@ from rigcal.sim.scene import (
     Print,
     Scene,
     Target,
+    board_panel,
     box_panels,
     marker_cells,
     marker_dictionary,
@@ -517,3 +519,78 @@ def test_a_large_picture_full_of_edges_can_be_rendered() -> None:
     scene = Scene(panels=(*stripes, replace(carpet, contrast=0.1)), light=FLAT_LIGHT)
     # Two pixels of four are striped.
     assert render_image(scene, view, np.eye(4)).mean() == pytest.approx(0.5, abs=1e-3)
+
+
+# --- boards ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_board_is_held_up_to_cameras_on_an_arc() -> None:
+    simulation = simulate("board-moved", seed=2)
+    rig, board = simulation.rig, simulation.target.board
+    assert isinstance(board, CharucoBoard)
+    assert (rig.n_cameras, rig.n_frames, rig.width, rig.height) == (4, 25, 1280, 720)
+    assert simulation.truth_document()["_meta"]["truth"]["board"] == "charuco:7x5:0.1:0.075:DICT_4X4_50"
+    shared = 0
+    for T_world_target in simulation.T_world_target:
+        sights = [
+            len(seen_markers(view, simulation.T_world_cam[view.name], simulation.target, T_world_target))
+            for view in simulation.recording.cameras
+        ]
+        shared += sum(n >= 9 for n in sights) >= 2
+    assert shared == rig.n_frames
+    bent = simulate("board-moved", seed=2, distortion=True)
+    assert all(view.has_distortion for view in bent.recording.cameras)
+    np.testing.assert_array_equal(bent.T_world_target, simulation.T_world_target)
+
+
+def test_a_rendered_board_shows_opencvs_corners_where_projection_says() -> None:
+    simulation = simulate("board-moved", seed=2)
+    board = simulation.target.board
+    assert isinstance(board, CharucoBoard)
+    view = max(
+        simulation.recording.cameras,
+        key=lambda c: len(
+            seen_markers(c, simulation.T_world_cam[c.name], simulation.target, simulation.T_world_target[0])
+        ),
+    )
+    (frame,) = simulation.recording.frames(view.name, [0])
+    size, dictionary = (board.columns, board.rows), marker_dictionary(board.dictionary)
+    detector = cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary))
+    corners, ids, _, _ = detector.detectBoard(frame.image)
+    assert len(ids) >= 12
+    T_cam_target = invert_transform(simulation.T_world_cam[view.name]) @ simulation.T_world_target[0]
+    points = np.concatenate([board_geometry(board)[int(k)] for k in np.ravel(ids)])
+    error = np.asarray(corners).reshape(-1, 2) - lens.project(view, transform_points(T_cam_target, points))
+    # OpenCV's own corners err by 0.05 px in the median; another frame, order or handedness would be squares off.
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.15
+
+
+def test_a_board_whose_cells_do_not_divide_its_squares_looks_the_same() -> None:
+    one_print = parse_board("charuco:3x3:0.1:0.075:DICT_4X4_50")
+    layers = parse_board("charuco:3x3:0.1:0.0750001:DICT_4X4_50")
+    T_world_board = make_pose(np.eye(3), np.array([-0.15, -0.15, 0.4]))
+    panels = [board_panel(board, T_world_board) for board in (one_print, layers)]
+    assert [len(panel.prints) for panel in panels] == [1, 1 + 4]
+    a, b = (render_image(Scene(panels=(panel,), light=FLAT_LIGHT), camera(), np.eye(4)) for panel in panels)
+    # 55 rays leave 0.01 of contrast in a pixel on an edge, and the edges differ by 1e-5 px.
+    assert np.abs(a - b).max() < 0.06
+    assert np.abs(a - b).mean() < 1e-3
+
+
+def test_tags_of_a_grid_stand_upright_between_black_squares() -> None:
+    grid = parse_board("aprilgrid:2x2:0.1:0.3")
+    # Kalibr's frame has y up and z towards the viewer; the camera's y points down.
+    T_world_board = make_pose(np.diag([1.0, -1.0, -1.0]), np.array([-0.115, 0.115, 0.3]))
+    view = camera()
+    image = render_image(Scene(panels=(board_panel(grid, T_world_board),), light=FLAT_LIGHT), view, np.eye(4))
+    cell = 0.01
+
+    def at(x: float, y: float) -> float:
+        u, v = np.rint(lens.project(view, transform_points(T_world_board, np.array([[x, y, 0.0]])))[0]).astype(int)
+        return float(image[v, u])
+
+    # The first row of the first tag of 36h11 as its authors publish it, 110101, below a border of two cells.
+    row = [at((2.5 + k) * cell, 0.1 - 2.5 * cell) for k in range(6)]
+    np.testing.assert_allclose(row, np.where([1, 1, 0, 1, 0, 1], WHITE_ALBEDO, BLACK_ALBEDO), atol=1e-6)
+    assert at(0.115, 0.115) == pytest.approx(BLACK_ALBEDO)
+    assert at(0.115, 0.05) == pytest.approx(WHITE_ALBEDO)

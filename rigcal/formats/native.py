@@ -8,25 +8,20 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from aruco.errors import InputError, OutputError
+from aruco.atomic import write_whole
+from aruco.errors import InputError
 from aruco.model import Calibration, CameraPose, UpAxis
-from aruco.pose_math import Pose, checked_pose
+from aruco.pose_math import Pose, checked_pose, pose_text
 
 FORMAT, VERSION = "rigcal.extrinsics", 1
 MAX_FILE_BYTES = 64 * 2**20
 UP_VECTORS: dict[UpAxis, list[int]] = {"+y": [0, 1, 0], "-y": [0, -1, 0]}
-
-
-def pose_text(T_world_cam: Pose) -> str:
-    """Sixteen numbers, row by row; each reads back as the same float64."""
-    return " ".join(repr(float(number) + 0.0) for number in T_world_cam.ravel())
 
 
 def document(calibration: Calibration) -> dict[str, Any]:
@@ -68,43 +63,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(path)
-    except OSError as error:
-        try_remove(part)
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another --output.") from error
-
-
-def try_remove(path: Path) -> None:
-    """Remove a left-over file; what cannot be removed stays."""
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return
-
-
-def check_writable(path: Path) -> None:
-    """Find out before the work, not after it, whether a file can be written.
-
-    Raises:
-        OutputError: Its folder does not exist or may not be written, or the path is a folder.
-    """
-    if path.is_dir():
-        raise OutputError(f"{path}: is a folder; give --output the name of a file.")
-    if not path.parent.is_dir():
-        raise OutputError(f"{path}: the folder {path.parent} does not exist; create it or choose another --output.")
-    probe = path.with_name(path.name + ".part")
-    try:
-        probe.open("ab").close()
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another --output.") from error
-    try_remove(probe)
+    write_whole(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_poses(path: Path) -> dict[str, Pose]:

@@ -23,6 +23,7 @@ def console(*, stderr: bool = False) -> Console:
 
 def show_calibration(out: Console, calibration: Calibration) -> None:
     """Per camera: frames, markers, residuals, spread; then warnings, cameras without a pose, and the world."""
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title="Cameras", title_justify="left")
@@ -45,7 +46,7 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
         x, y, z = camera.T_world_cam[:3, 3]
         alone = camera.n_frames < 2
         table.add_row(
-            camera.camera,
+            escape(camera.camera),
             str(camera.n_frames),
             str(camera.n_markers),
             f"{camera.rms_px:.3f}",
@@ -103,6 +104,7 @@ def show_errors(
         pair_errors: (camera, camera) -> error of their relative pose [rad], [m].
         tilt_rad: Angle between the estimated and the true up.
     """
+    from rich.markup import escape
     from rich.table import Table
 
     spread = {camera.camera: camera.spread_m for camera in calibration.cameras}
@@ -112,6 +114,6 @@ def show_errors(
         table.add_column(name, justify="right")
     for (i, j), (angle, distance) in pair_errors.items():
         both = math.hypot(spread[i], spread[j])
-        table.add_row(f"{i} - {j}", f"{1e3 * distance:.2f}", f"{math.degrees(angle):.4f}", f"{1e3 * both:.2f}")
+        table.add_row(escape(f"{i} - {j}"), f"{1e3 * distance:.2f}", f"{math.degrees(angle):.4f}", f"{1e3 * both:.2f}")
     out.print(table)
     out.print(f"Up differs from gravity by {math.degrees(tilt_rad):.4f} degrees.", markup=False)

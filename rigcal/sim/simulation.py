@@ -18,7 +18,7 @@ from aruco.board import board_face, board_text, parse_board
 from aruco.errors import InputError
 from aruco.marker_geometry import SHIPPED_MAPS, Face, load_faces
 from aruco.model import Camera, Frame
-from aruco.pose_math import Pose, transform_points
+from aruco.pose_math import Pose, pose_text, transform_points
 from rigcal.sim.noise import (
     DepthBias,
     DepthNoise,
@@ -190,11 +190,6 @@ class Simulation:
             "truth": truth,
         }
         return {**{name: {"pose": pose_text(T)} for name, T in self.T_world_cam.items()}, "_meta": meta}
-
-
-def pose_text(T_a_b: Pose) -> str:
-    """The sixteen numbers of a pose, row by row; each reads back as the same float64."""
-    return " ".join(repr(float(number)) for number in T_a_b.ravel())
 
 
 def focal_baseline(camera: Camera) -> float:

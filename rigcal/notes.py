@@ -1,0 +1,70 @@
+"""What a calibration says about itself under ``_meta``: counts, clock, adjustment, provenance.
+
+Owns      the wording of these entries; nothing in them depends on time, place or the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from aruco.model import Recording
+from rigcal import __version__
+from rigcal.config import CalibrateConfig
+from rigcal.detecting import Seen, digest_of
+from rigcal.frames import Moments
+from rigcal.solve.graph import GraphHealth
+from rigcal.solve.joint import JointRig
+from rigcal.target import Target
+
+
+def frame_counts(seen: Mapping[str, Seen]) -> dict[str, Any]:
+    """Camera -> what became of its frames."""
+    return {
+        name: {
+            "recorded": s.counts.recorded,
+            "unpaired": s.counts.unpaired,
+            "read": s.counts.read,
+            "unreadable": s.counts.bad,
+            "with_markers": s.counts.with_markers,
+        }
+        for name, s in seen.items()
+    }
+
+
+def clock(moments: Moments) -> dict[str, Any]:
+    """How well the frames of the cameras go together."""
+    sync = moments.sync
+    return {
+        "tolerance_ms": sync.tolerance_ns / 1e6,
+        "groups": len(sync.groups),
+        "used": len(moments.groups),
+        "median_skew_ms": sync.median_span_ns / 1e6,
+        "worst_skew_ms": sync.worst_span_ns / 1e6,
+    }
+
+
+def adjustment(joint: JointRig) -> dict[str, Any]:
+    """What the joint adjustment found out about its input."""
+    return {
+        "residual_scale": joint.scale,
+        "rejected_views": {name: list(frames) for name, frames in joint.rejected.items()},
+        "odd_markers": {str(marker): ratio for marker, ratio in joint.odd_markers.items()},
+    }
+
+
+def connections(health: GraphHealth) -> dict[str, Any]:
+    """Who sees the target together with whom."""
+    return health.as_dict()
+
+
+def provenance(
+    recording: Recording, target: Target, config: CalibrateConfig, seen: Mapping[str, Seen]
+) -> dict[str, Any]:
+    """Version, every option that changes the result, and hashes of the inputs."""
+    inputs = {camera.name: digest_of(seen[camera.name], camera) for camera in recording.cameras}
+    return {
+        "rigcal": __version__,
+        "options": config.as_dict(),
+        "inputs_sha256": {"target": target.digest, "cameras": inputs},
+    }
