@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from aruco.model import Calibration
     from rigcal.config import CalibrateConfig
 
-INCOMPLETE = 3  # exit code: poses were written, but not of every camera
+DOUBTFUL = 3  # exit code: poses were written, but not of every camera, or they are called bad
 
 
 @click.command(context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
@@ -65,7 +65,7 @@ def main(**given: Any) -> None:
     """Find out where the cameras of a rig stand.
 
     Put a box of ArUco or AprilTag markers on the floor, record it with all cameras, and give the recordings here.
-    Exit codes: 0 all cameras placed, 1 an error, 2 wrong usage, 3 written, but not for every camera.
+    Exit codes: 0 all cameras placed, 1 an error, 2 wrong usage, 3 written, but not for every camera, or called bad.
     """
     if not (given["svo"] or given["inputs"]):
         raise click.UsageError(
@@ -80,7 +80,7 @@ def main(**given: Any) -> None:
     with cli.telling_errors(debug=given["debug"]):
         calibration = _run(given)
         cli.tell(calibration, given["output"])
-        raise SystemExit(0 if calibration.is_whole else INCOMPLETE)
+        raise SystemExit(0 if calibration.is_whole and not calibration.is_bad else DOUBTFUL)
 
 
 def _run(given: dict[str, Any]) -> Calibration:

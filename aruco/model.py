@@ -245,3 +245,8 @@ class Calibration:
     def is_whole(self) -> bool:
         """Whether every camera of the recording has a pose."""
         return not self.lost
+
+    @property
+    def is_bad(self) -> bool:
+        """Whether the checks on what was not used call it bad."""
+        return self.notes.get("quality", {}).get("verdict") == "bad"

@@ -131,7 +131,7 @@ def cameras_without_views(recording: Recording, sync: SyncResult, seen: Mapping[
         if s.views:
             continue
         if not counts.recorded:
-            reasons[camera.name] = "has no images"
+            reasons[camera.name] = "has no image named <stamp_ns>.png or .jpg in its image folder"
         elif counts.bad and not counts.read:
             reasons[camera.name] = f"none of its {counts.bad} frames can be read ({s.first_bad})"
         elif not counts.read:

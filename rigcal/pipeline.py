@@ -29,10 +29,13 @@ from rigcal.config import AlignConfig, CalibrateConfig, Resources
 from rigcal.detecting import OnFrame, Seen, watch
 from rigcal.frames import Moments, each_alone, synchronised
 from rigcal.preview_writer import PreviewWriter
+from rigcal.quality.gates import Quality
 from rigcal.solve.graph import graph_health
 from rigcal.solve.joint import JointRig, adjust_rig
 from rigcal.sources import open_recordings
 from rigcal.target import Target, board_target, marker_target_from_file
+from rigcal.validation import validate
+from rigcal.verdict import depth_below_target, quality_of
 
 
 def calibrate(
@@ -73,6 +76,7 @@ def calibrate(
     if config.still:
         seen = still_moments(recording, target, moments, seen)
     rig = place_cameras(recording.cameras, seen, target.geometry, moving=config.moving_target or config.still)
+    average = rig
     joint = adjust(rig, recording, seen, target, config) if config.joint else None
     rig = rig if joint is None else joint.rig
     used = {name: {f: seen[name].detections[f] for f in p.frames} for name, p in rig.cameras.items()}
@@ -80,9 +84,10 @@ def calibrate(
     rig = diagnosis.refuse_misfits(rig, residuals, recording.cameras)
     T_aligned_world, aligned = align(rig, target.faces, config.align, moving=config.moving_target or config.still)
     rig = rig.turned(T_aligned_world[:3, :3])
-    about = {"frames": notes.frame_counts(seen), "sync": notes.clock(moments)}
+    about: dict[str, Any] = {"frames": notes.frame_counts(seen), "sync": notes.clock(moments)}
     if joint is not None:
         about["adjusted"] = notes.adjustment(joint)
+        about["quality"] = assess(average, joint, rig, recording, seen, target, config).as_dict()
     if len(seen) > 1 and config.moving_target:
         about["connections"] = notes.connections(graph_health({name: s.detections for name, s in seen.items()}))
     return Calibration(
@@ -172,6 +177,29 @@ def adjust(
     detections = {name: s.detections for name, s in seen.items()}
     moving = config.moving_target or config.still
     return adjust_rig(rig, recording.cameras, detections, target.geometry, moving=moving)
+
+
+def assess(
+    average: RigEstimate,
+    joint: JointRig,
+    rig: RigEstimate,
+    recording: Recording,
+    seen: Mapping[str, Seen],
+    target: Target,
+    config: CalibrateConfig,
+) -> Quality:
+    """The verdict, from what was held out; ``rig`` is the finished one, in its upright world if it has one."""
+    validation = validate(
+        average,
+        joint,
+        recording.cameras,
+        {name: s.detections for name, s in seen.items()},
+        target.geometry,
+        moving=config.moving_target or config.still,
+    )
+    up = (0, 1 if config.align.up_axis == "+y" else -1, 0)
+    below = depth_below_target(rig, target.geometry, up=up) if config.align.enabled else None
+    return quality_of(validation, below_target_m=below)
 
 
 def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, moving: bool) -> tuple[Pose, dict[str, Any]]:

@@ -277,8 +277,9 @@ def test_other_files_are_ignored_and_png_wins(tmp_path: Path) -> None:
     (folder / "image" / "5.png").mkdir()
     (folder / "image" / "6.png").symlink_to(tmp_path / "nowhere")
     recording = RgbdFolder(tmp_path)
-    assert recording.stamps_ns("left").tolist() == [1, 2]
-    assert all(isinstance(frame, Frame) for frame in read_all(recording, "left"))
+    # What is named like a frame and is none counts as a bad frame: nothing disappears without a word.
+    assert recording.stamps_ns("left").tolist() == [1, 2, 5, 6]
+    assert [isinstance(frame, Frame) for frame in read_all(recording, "left")] == [True, True, False, False]
 
 
 def test_stamps_cannot_be_changed(tmp_path: Path) -> None:
@@ -584,7 +585,7 @@ def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
     assert len(RgbdFolder(tmp_path / "out").cameras) == 2
 
 
-@pytest.mark.parametrize("name", ["../escape", "a/b", "", ".."])
+@pytest.mark.parametrize("name", ["../escape", "a/b", ".."])
 def test_a_camera_name_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
     source = InMemory()
     source.cameras = (camera_named(name), camera_named("right"))

@@ -62,6 +62,7 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
     for name, reason in calibration.lost.items():
         out.print(f"no pose: camera {name}: {reason}", markup=False)
     _show_clock(out, calibration)
+    _show_verdict(out, calibration)
     out.print(_world(calibration), markup=False)
 
 
@@ -83,6 +84,15 @@ def _show_clock(out: Console, calibration: Calibration) -> None:
         f"at most {clock['worst_skew_ms']:.1f} ms; frames without a partner: {without}",
         markup=False,
     )
+
+
+def _show_verdict(out: Console, calibration: Calibration) -> None:
+    quality = calibration.notes.get("quality")
+    if not quality:
+        return
+    out.print(f"Verdict: {quality['verdict']}", markup=False)
+    for reason in quality["reasons"]:
+        out.print(f"  - {reason}", markup=False)
 
 
 def _world(calibration: Calibration) -> str:

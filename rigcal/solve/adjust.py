@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aruco.pose_math import Array, exp_se3
+from aruco.pose_math import Array, Pose, exp_so3
 from rigcal.solve.problem import Poses, Sightings, ViewSums, residuals, view_sums
 
 # 95 % efficient for clean Gaussian corners (Holland and Welsch 1977: 2.385), deaf to gross errors.
@@ -64,14 +64,15 @@ def adjust(sightings: Sightings, start: Poses, gauge: Gauge) -> Adjustment:
     """
     poses = start
     sums = view_sums(sightings, poses, np.inf)
+    dof = _dof(sightings, gauge)
     steps = 0
     for _ in range(RESCALINGS):
-        scale = _scale(sums.squares)
+        scale = _scale(sums.squares, dof)
         poses, sums, took = _minimise(sightings, poses, gauge, KAPPA * scale)
         steps += took
-        if abs(_scale(sums.squares) - scale) < SETTLED_SCALE * scale:
+        if abs(_scale(sums.squares, dof) - scale) < SETTLED_SCALE * scale:
             break
-    scale = _scale(sums.squares)
+    scale = _scale(sums.squares, dof)
     return Adjustment(
         poses=poses,
         residuals=residuals(sightings, poses),
@@ -81,8 +82,18 @@ def adjust(sightings: Sightings, start: Poses, gauge: Gauge) -> Adjustment:
     )
 
 
-def _scale(squares: Array) -> float:
-    return max(float(np.sqrt(np.nanmedian(squares))) / RAYLEIGH_MEDIAN, MIN_SCALE)
+def _dof(sightings: Sightings, gauge: Gauge) -> int:
+    """Residuals beyond the unknowns."""
+    seen = np.zeros(len(sightings.frames), dtype=bool)
+    seen[sightings.view_frame] = True
+    n_free = 6 * int((~gauge.fixed_cameras).sum() + (seen & ~gauge.fixed_frames).sum())
+    return max(2 * len(sightings.points) - n_free, 0)
+
+
+def _scale(squares: Array, dof: int) -> float:
+    """Robust standard deviation of a residual coordinate; what the unknowns have absorbed is given back."""
+    absorbed = (2 * len(squares) + PRIOR_DOF) / (dof + PRIOR_DOF)
+    return max(float(np.sqrt(np.median(squares) * absorbed)) / RAYLEIGH_MEDIAN, MIN_SCALE)
 
 
 def _minimise(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) -> tuple[Poses, ViewSums, int]:
@@ -113,9 +124,15 @@ def _cost(squares: Array, kappa: float) -> float:
     return kappa**2 * cost if np.isfinite(cost) else np.inf
 
 
-def _moved(T: Array, xi: Array) -> Array:
-    """Poses (k, 4, 4) after left perturbations (k, 6)."""
-    return np.array([exp_se3(x) @ pose if x.any() else pose for x, pose in zip(xi, T)]).reshape(T.shape)
+def _moved(T: Pose, xi: Array) -> Pose:
+    """Poses (k, 4, 4) after left steps (k, 6): to first order ``Exp(xi) @ T``, which is all that a step is good for."""
+    R = exp_so3(xi[:, :3])
+    moved = T.copy()
+    moved[:, :3] = R @ T[:, :3]
+    moved[:, :3, 3] += xi[:, 3:]
+    still = ~xi.any(axis=1)
+    moved[still] = T[still]
+    return moved
 
 
 def _solve(sightings: Sightings, system: ViewSums, gauge: Gauge, damping: float) -> tuple[Array, Array]:
@@ -136,16 +153,12 @@ def _solve(sightings: Sightings, system: ViewSums, gauge: Gauge, damping: float)
 def _blocks(sightings: Sightings, system: ViewSums) -> tuple[Array, Array, Array, Array, Array]:
     """H and g of cameras and targets, and the coupling E (f, 6 c, 6)."""
     n_cam, n_frame = len(sightings.cameras), len(sightings.frames)
-    c, f = sightings.view_camera, sightings.view_frame
-    H_cam, g_cam = np.zeros((n_cam, 6, 6)), np.zeros((n_cam, 6))
-    H_target, g_target = np.zeros((n_frame, 6, 6)), np.zeros((n_frame, 6))
-    np.add.at(H_cam, c, system.W)
-    np.add.at(g_cam, c, -system.g)  # a camera's derivative is the target's with the other sign
-    np.add.at(H_target, f, system.W)
-    np.add.at(g_target, f, system.g)
-    E = np.zeros((n_frame, n_cam, 6, 6))
-    np.add.at(E, (f, c), -system.W)
-    return H_cam, g_cam, H_target, g_target, E.reshape(n_frame, 6 * n_cam, 6)
+    view = (sightings.view_frame, sightings.view_camera)  # every pair is one view, or none
+    W, g = np.zeros((n_frame, n_cam, 6, 6)), np.zeros((n_frame, n_cam, 6))
+    W[view], g[view] = system.W, system.g
+    E = -W.reshape(n_frame, 6 * n_cam, 6)
+    # A camera's derivative is the target's with the other sign.
+    return W.sum(axis=0), -g.sum(axis=0), W.sum(axis=1), g.sum(axis=1), E
 
 
 def _damped(H: Array, damping: float) -> Array:
@@ -186,15 +199,12 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
     covariance = np.zeros_like(S)
     if free.any():
         inverse = np.linalg.inv(S[np.ix_(free, free)])
-        covariance[np.ix_(free, free)] = _variance(sightings, system.squares, gauge, kappa) * (inverse + inverse.T) / 2
+        variance = _variance(system.squares, _dof(sightings, gauge), kappa)
+        covariance[np.ix_(free, free)] = variance * (inverse + inverse.T) / 2
     return covariance
 
 
-def _variance(sightings: Sightings, squares: Array, gauge: Gauge, kappa: float) -> float:
+def _variance(squares: Array, dof: int, kappa: float) -> float:
     """Variance of a residual coordinate in the corners' variances, from the residuals and a little from the sigmas."""
     w2 = (1.0 + squares / kappa**2) ** -2
-    seen = np.zeros(len(sightings.frames), dtype=bool)
-    seen[sightings.view_frame] = True
-    n_free = 6 * int((~gauge.fixed_cameras).sum() + (seen & ~gauge.fixed_frames).sum())
-    dof = max(2 * len(squares) - n_free, 0)
     return float(((w2 * squares).sum() + PRIOR_DOF) / (dof + PRIOR_DOF) / w2.mean())

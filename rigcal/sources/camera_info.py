@@ -82,6 +82,8 @@ def dump_camera_info(camera: Camera) -> str:
 
 
 def _parsed(path: Path) -> Mapping[str, Any]:
+    if path.exists() and not path.is_file():  # opening a pipe would wait for ever
+        raise InputError(f"{path}: is not a file; a camera's folder needs {FILE_NAME} beside image/.")
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"{path}: over {MAX_FILE_BYTES >> 10} KiB, which is not a camera_info file.")

@@ -37,6 +37,8 @@ class ImageFileError(Exception):
 
 def read_bytes(path: Path) -> bytes:
     """The bytes of a file of sane size; raises ImageFileError."""
+    if path.exists() and not path.is_file():  # opening a pipe would wait for ever
+        raise ImageFileError("is not a file")
     try:
         size = path.stat().st_size
         if size > MAX_FILE_BYTES:

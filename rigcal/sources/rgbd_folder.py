@@ -133,10 +133,10 @@ def _candidates(folder: Path, suffixes: Sequence[str]) -> Iterator[tuple[int, st
             for entry in entries:
                 match = _STAMPED_NAME.fullmatch(entry.name)
                 known = match is not None and match[2].lower() in suffixes and abs(int(match[1])) <= MAX_STAMP_NS
-                if match is not None and known and entry.is_file():
+                if match is not None and known:  # what is named like a frame and is none is a bad frame when read
                     yield suffixes.index(match[2].lower()), entry.name
                 else:
-                    logger.debug("{}: {} is ignored, not <stamp_ns>{}", folder, entry.name, " or ".join(suffixes))
+                    logger.warning("{}: {} is ignored, not <stamp_ns>{}", folder, entry.name, " or ".join(suffixes))
     except OSError as error:
         raise InputError(f"{folder}: cannot be read ({error.strerror or error}); mend its permissions.") from error
 
