@@ -136,7 +136,10 @@ def cameras_without_views(recording: Recording, sync: SyncResult, seen: Mapping[
             reasons[camera.name] = f"none of its {counts.bad} frames can be read ({s.first_bad})"
         elif not counts.read:
             tolerance = sync.tolerance_ns / 1e6
-            reasons[camera.name] = f"none of its {counts.recorded} frames has a partner within {tolerance:g} ms"
+            reasons[camera.name] = (
+                f"none of its {counts.recorded} frames has a partner within {tolerance:.1f} ms: check its clock, raise "
+                "--sync-tolerance-ms, or pass --still"
+            )
         elif not counts.with_markers:
             reasons[camera.name] = f"never sees the target in {counts.read} frames"
         else:
@@ -182,7 +185,8 @@ def warnings(placement: Placement, residuals: Reprojection, seen: Seen, up: Arra
             yield f"is rolled by {roll_deg:.0f} degrees: mounted sideways or upside down, or the world is not upright"
     left_out = placement.n_views - len(placement.frames)
     if seen.counts.bad:
-        yield f"{seen.counts.bad} unreadable frames left out ({seen.first_bad})"
+        frames = "1 unreadable frame" if seen.counts.bad == 1 else f"{seen.counts.bad} unreadable frames"
+        yield f"{frames} left out ({seen.first_bad})"
     if left_out > (1 - MIN_USED_SHARE) * placement.n_views:
         yield f"{left_out} of {placement.n_views} views do not fit the others"
     if len(placement.frames) == 1:

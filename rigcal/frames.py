@@ -40,8 +40,8 @@ def synchronised(recording: Recording, config: FrameConfig) -> Moments:
     if not len(sync.groups):
         closest = "" if sync.closest_ns is None else f" (closest: {sync.closest_ns / 1e6:.1f} ms apart)"
         raise InputError(
-            f"No two cameras have frames within {sync.tolerance_ns / 1e6:g} ms of each other{closest}: check that the "
-            "recordings were made together and on one clock, raise --sync-tolerance-ms, or pass --still."
+            f"No two cameras have frames within {sync.tolerance_ns / 1e6:.1f} ms of each other{closest}: check that "
+            "the recordings were made together and on one clock, raise --sync-tolerance-ms, or pass --still."
         )
     return Moments(sync=sync, groups=sample(sync.groups, config.sample_interval, config.max_samples))
 

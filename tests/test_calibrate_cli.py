@@ -16,12 +16,14 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner, Result
 
+from aruco.board import board_text
 from aruco.marker_geometry import SHIPPED_MAPS, load_faces
 from calibrate_extrinsics import main
 from rigcal.formats.native import read_poses
 from rigcal.quality.truth import pair_errors, tilt_error
-from rigcal.sim import Simulation
+from rigcal.sim import Simulation, simulate
 from rigcal.sources.camera_info import load_camera_info
+from rigcal.sources.rgbd_folder import write_recording
 
 BOX = SHIPPED_MAPS / "standard_box_markers.parquet"
 
@@ -325,6 +327,26 @@ def test_an_svo_says_what_to_do(tmp_path: Path) -> None:
     svo = tmp_path / "rec.svo2"
     svo.write_bytes(b"x" * 100)
     assert_one_sentence(run("--svo", svo, "--markers", BOX, "-o", tmp_path / "o.json"), "rec.svo2", "RGB-D")
+
+
+def test_a_board_in_place_of_a_map(tmp_path: Path) -> None:
+    simulation = simulate("board-moved", seed=1, n_frames=6, depth=False)
+    write_recording(simulation.recording, tmp_path / "rec", depth=False)
+    assert simulation.target.board is not None
+    out = tmp_path / "out.json"
+    board = board_text(simulation.target.board)
+    result = run("--input", tmp_path / "rec", "--board", board, "--moving-target", "-o", out)
+    assert result.exit_code == 0, result.output
+    errors = pair_errors(read_poses(out), simulation.T_world_cam)
+    # Six views of 24 corners at 0.02 px and 3 mm a pixel: a fifth of a millimetre; the issue asks for 1.6 mm at worst.
+    assert max(distance for _, distance in errors.values()) < 1e-3
+    exchanged = run("--input", tmp_path / "rec", "--board", board.replace("7x5", "5x7"), "-o", tmp_path / "no.json")
+    assert_one_sentence(exchanged, "--board")
+
+
+def test_markers_and_board_together_or_neither_are_wrong_usage(demo_folder: Path) -> None:
+    assert run("--input", demo_folder, "--board", "charuco:4x5:1:0.5:DICT_4X4_50", "--markers", BOX).exit_code == 2
+    assert run("--input", demo_folder).exit_code == 2
 
 
 def test_a_target_that_was_moved_asks_for_the_flag(cube3_b: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from benchmarks.tone_curve import BentRecording
 from rigcal.sim import Simulation, simulate
 from rigcal.sim.noise import ImageNoise
 
-LIMITS = {"pair_median_mm": 2.5, "pair_median_deg": 0.06, "pair_worst_mm": 8.0, "pair_worst_deg": 0.15}
+LIMITS = {"pair_median_mm": 2.5, "pair_median_deg": 0.06, "pair_worst_mm": 5.0, "pair_worst_deg": 0.15}
 ROUGH = ImageNoise(blur_px=1.0, read_noise=4.0, shot_noise=0.0)
 
 
