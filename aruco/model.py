@@ -205,6 +205,7 @@ class CameraPose:
     spread_m: float  # root mean square distance of single views from the average
     spread_rad: float
     covariance: Array | None = None  # (6, 6) of the left perturbation (rotation, translation), world axes
+    least_known: str = ""  # the least observable direction in words; empty without a covariance
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -22,7 +22,7 @@ from aruco.pose_math import Array, Pose, make_pose
 from aruco.reprojection import Reprojection, reproject
 from aruco.rig_estimate import RigEstimate
 from aruco.still import merge_stretches, still_stretches
-from aruco.uncertainty import carried
+from aruco.uncertainty import camera_sigma, carried, least_known
 from aruco.view_pose import solve_view, variance_factor
 from rigcal import diagnosis, notes
 from rigcal.config import AlignConfig, CalibrateConfig, Resources
@@ -222,6 +222,13 @@ def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, movin
     return make_pose(aligned.R_align, np.zeros(3)), {"aligned": note}
 
 
+def _least_known(name: str, joint: JointRig, seen: Seen) -> str:
+    """The least observable direction of a camera in words; turns count at the distance of the target."""
+    sigma = camera_sigma(joint.covariance[name], joint.rig.cameras[name].T_world_cam)
+    reach_m = float(np.median([np.linalg.norm(view.best.T_cam_target[:3, 3]) for view in seen.views]))
+    return least_known(name, sigma, reach_m)
+
+
 def _camera_poses(
     rig: RigEstimate,
     seen: Mapping[str, Seen],
@@ -242,6 +249,7 @@ def _camera_poses(
             spread_m=placement.spread_m,
             spread_rad=placement.spread_rad,
             covariance=None if joint is None else carried(joint.covariance[name], T_aligned_world),
+            least_known="" if joint is None else _least_known(name, joint, seen[name]),
             warnings=tuple(diagnosis.warnings(placement, residuals[name], seen[name], up)),
         )
         for name, placement in sorted(rig.cameras.items())

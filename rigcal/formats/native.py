@@ -44,6 +44,7 @@ def _entry(camera: CameraPose) -> dict[str, Any]:
         "rms_px": camera.rms_px,
         "spread_mm": 1e3 * camera.spread_m,
         "spread_deg": math.degrees(camera.spread_rad),
+        **({"least_known": camera.least_known} if camera.least_known else {}),
         "warnings": list(camera.warnings),
     }
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from aruco.model import Calibration, CameraPose
+from aruco.pose_math import Array
 from aruco.uncertainty import camera_sigma
 
 if TYPE_CHECKING:
@@ -56,6 +57,10 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
             *(f"{value:.3f}" for value in (x, y, z)),
         )
     out.print(table)
+    known = [camera for camera in calibration.cameras if camera.covariance is not None]
+    if known:
+        least = max(known, key=lambda camera: camera_sigma(_covariance(camera), camera.T_world_cam).total_m)
+        out.print(f"Least known: {least.least_known}.", markup=False)
     for camera in calibration.cameras:
         for warning in camera.warnings:
             out.print(f"warning: camera {camera.camera}: {warning}", markup=False)
@@ -64,6 +69,11 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
     _show_clock(out, calibration)
     _show_verdict(out, calibration)
     out.print(_world(calibration), markup=False)
+
+
+def _covariance(camera: CameraPose) -> Array:
+    assert camera.covariance is not None
+    return camera.covariance
 
 
 def _known_to(camera: CameraPose) -> tuple[str, ...]:
