@@ -61,6 +61,11 @@ class CalibrateConfig:
     joint: bool = True  # adjust all cameras and frames together after the average
     seed: int = 0
 
+    @property
+    def target_moves(self) -> bool:
+        """Whether the target has a pose of its own in every frame; in every stretch, where rests are used."""
+        return self.moving_target or self.still
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for the provenance."""
         return asdict(self)

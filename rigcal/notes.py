@@ -13,7 +13,6 @@ from rigcal import __version__
 from rigcal.config import CalibrateConfig
 from rigcal.detecting import Seen, digest_of
 from rigcal.frames import Moments
-from rigcal.solve.graph import GraphHealth
 from rigcal.solve.joint import JointRig
 from rigcal.target import Target
 
@@ -51,11 +50,6 @@ def adjustment(joint: JointRig) -> dict[str, Any]:
         "rejected_views": {name: list(frames) for name, frames in joint.rejected.items()},
         "odd_markers": {str(marker): ratio for marker, ratio in joint.odd_markers.items()},
     }
-
-
-def connections(health: GraphHealth) -> dict[str, Any]:
-    """Who sees the target together with whom."""
-    return health.as_dict()
 
 
 def provenance(

@@ -75,21 +75,21 @@ def calibrate(
     diagnosis.require_views(recording, target, config.detect, seen)
     if config.still:
         seen = still_moments(recording, target, moments, seen)
-    rig = place_cameras(recording.cameras, seen, target.geometry, moving=config.moving_target or config.still)
+    rig = place_cameras(recording.cameras, seen, target.geometry, moving=config.target_moves)
     average = rig
     joint = adjust(rig, recording, seen, target, config) if config.joint else None
     rig = rig if joint is None else joint.rig
     used = {name: {f: seen[name].detections[f] for f in p.frames} for name, p in rig.cameras.items()}
     residuals = reproject({camera.name: camera for camera in recording.cameras}, rig, used, target.geometry)
     rig = diagnosis.refuse_misfits(rig, residuals, recording.cameras)
-    T_aligned_world, aligned = align(rig, target.faces, config.align, moving=config.moving_target or config.still)
+    T_aligned_world, aligned = align(rig, target.faces, config.align, moving=config.target_moves)
     rig = rig.turned(T_aligned_world[:3, :3])
     about: dict[str, Any] = {"frames": notes.frame_counts(seen), "sync": notes.clock(moments)}
     if joint is not None:
         about["adjusted"] = notes.adjustment(joint)
         about["quality"] = assess(average, joint, rig, recording, seen, target, config).as_dict()
     if len(seen) > 1 and config.moving_target:
-        about["connections"] = notes.connections(graph_health({name: s.detections for name, s in seen.items()}))
+        about["connections"] = graph_health({name: s.detections for name, s in seen.items()}).as_dict()
     return Calibration(
         cameras=_camera_poses(rig, seen, residuals, joint, T_aligned_world, config.align),
         lost={**diagnosis.cameras_without_views(recording, moments.sync, seen), **rig.lost},
@@ -175,7 +175,7 @@ def adjust(
 ) -> JointRig:
     """All cameras and frames together, from the average on."""
     detections = {name: s.detections for name, s in seen.items()}
-    moving = config.moving_target or config.still
+    moving = config.target_moves
     return adjust_rig(rig, recording.cameras, detections, target.geometry, moving=moving)
 
 
@@ -195,7 +195,7 @@ def assess(
         recording.cameras,
         {name: s.detections for name, s in seen.items()},
         target.geometry,
-        moving=config.moving_target or config.still,
+        moving=config.target_moves,
     )
     up = (0, 1 if config.align.up_axis == "+y" else -1, 0)
     below = depth_below_target(rig, target.geometry, up=up) if config.align.enabled else None

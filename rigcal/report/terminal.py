@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from aruco.model import Calibration, CameraPose
-from aruco.pose_math import Array
 from aruco.uncertainty import camera_sigma
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 
 def console(*, stderr: bool = False) -> Console:
@@ -24,43 +24,8 @@ def console(*, stderr: bool = False) -> Console:
 
 def show_calibration(out: Console, calibration: Calibration) -> None:
     """Per camera: frames, markers, residuals, spread; then warnings, cameras without a pose, and the world."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title="Cameras", title_justify="left")
-    table.add_column("camera")
-    adjusted = any(camera.covariance is not None for camera in calibration.cameras)
-    known = ("known to\n+- mm", "known to\n+- degrees") if adjusted else ()
-    for name in (
-        "frames",
-        "markers",
-        "reprojection\nRMS px",
-        "spread\nmm",
-        "spread\ndegrees",
-        *known,
-        "x m",
-        "y m",
-        "z m",
-    ):
-        table.add_column(name, justify="right")
-    for camera in calibration.cameras:
-        x, y, z = camera.T_world_cam[:3, 3]
-        alone = camera.n_frames < 2
-        table.add_row(
-            escape(camera.camera),
-            str(camera.n_frames),
-            str(camera.n_markers),
-            f"{camera.rms_px:.3f}",
-            "-" if alone else f"{1e3 * camera.spread_m:.2f}",
-            "-" if alone else f"{math.degrees(camera.spread_rad):.3f}",
-            *_known_to(camera),
-            *(f"{value:.3f}" for value in (x, y, z)),
-        )
-    out.print(table)
-    known = [camera for camera in calibration.cameras if camera.covariance is not None]
-    if known:
-        least = max(known, key=lambda camera: camera_sigma(_covariance(camera), camera.T_world_cam).total_m)
-        out.print(f"Least known: {least.least_known}.", markup=False)
+    out.print(_table(calibration))
+    _show_least_known(out, calibration)
     for camera in calibration.cameras:
         for warning in camera.warnings:
             out.print(f"warning: camera {camera.camera}: {warning}", markup=False)
@@ -71,9 +36,41 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
     out.print(_world(calibration), markup=False)
 
 
-def _covariance(camera: CameraPose) -> Array:
-    assert camera.covariance is not None
-    return camera.covariance
+def _table(calibration: Calibration) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title="Cameras", title_justify="left")
+    table.add_column("camera")
+    adjusted = any(camera.covariance is not None for camera in calibration.cameras)
+    known = ("known to\n+- mm", "known to\n+- degrees") if adjusted else ()
+    measured = ("frames", "markers", "reprojection\nRMS px", "spread\nmm", "spread\ndegrees")
+    for name in (*measured, *known, "x m", "y m", "z m"):
+        table.add_column(name, justify="right")
+    for camera in calibration.cameras:
+        alone = camera.n_frames < 2
+        table.add_row(
+            escape(camera.camera),
+            str(camera.n_frames),
+            str(camera.n_markers),
+            f"{camera.rms_px:.3f}",
+            "-" if alone else f"{1e3 * camera.spread_m:.2f}",
+            "-" if alone else f"{math.degrees(camera.spread_rad):.3f}",
+            *_known_to(camera),
+            *(f"{value:.3f}" for value in camera.T_world_cam[:3, 3]),
+        )
+    return table
+
+
+def _show_least_known(out: Console, calibration: Calibration) -> None:
+    known = [
+        (camera_sigma(camera.covariance, camera.T_world_cam).total_m, camera)
+        for camera in calibration.cameras
+        if camera.covariance is not None
+    ]
+    if known:
+        _, least = max(known, key=lambda pair: pair[0])
+        out.print(f"Least known: {least.least_known}.", markup=False)
 
 
 def _known_to(camera: CameraPose) -> tuple[str, ...]:

@@ -16,13 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aruco.merged_detection import RAYLEIGH_MEDIAN
 from aruco.pose_math import Array, Pose, exp_so3
 from rigcal.solve.problem import Poses, Sightings, ViewSums, residuals, view_sums
 
 # 95 % efficient for clean Gaussian corners (Holland and Welsch 1977: 2.385), deaf to gross errors.
 KAPPA = 2.385
-# The median distance of a two-dimensional unit normal.
-RAYLEIGH_MEDIAN = 1.17741
 MIN_SCALE = 1e-3
 MAX_STEPS = 60
 RESCALINGS = 6

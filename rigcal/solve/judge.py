@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aruco.errors import CalibrationError
+from aruco.merged_detection import RAYLEIGH_MEDIAN
 from aruco.pose_math import Array
-from rigcal.solve.adjust import RAYLEIGH_MEDIAN, Adjustment, Gauge, adjust
+from rigcal.solve.adjust import Adjustment, Gauge, adjust
 from rigcal.solve.problem import Poses, Sightings, residuals
 
 # The median of a view's corners, in robust standard deviations of all corners. One for ordinary views; small or
