@@ -12,6 +12,7 @@ KAPPA robust standard deviations.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from aruco.merged_detection import RAYLEIGH_MEDIAN
 from aruco.pose_math import Array, Pose, exp_so3
 from rigcal.solve.problem import Poses, Sightings, ViewSums, residuals, view_sums
+from rigcal.solve.repetition import repetition
 
 # 95 % efficient for clean Gaussian corners (Holland and Welsch 1977: 2.385), deaf to gross errors.
 KAPPA = 2.385
@@ -53,6 +55,60 @@ class Gauge:
     fixed_frames: NDArray[np.bool_]  # (f,)
 
 
+Unknowns = TypeVar("Unknowns")
+
+
+class Problem(Protocol[Unknowns]):
+    """What is minimised: corners whose residuals depend on some unknowns, which move in steps of two kinds."""
+
+    @property
+    def dof(self) -> int:
+        """Residuals beyond the unknowns."""
+        ...
+
+    def sums(self, unknowns: Unknowns, kappa: float) -> ViewSums:
+        """See problem.view_sums."""
+        ...
+
+    def step(self, unknowns: Unknowns, sums: ViewSums, damping: float) -> tuple[Array, Array]:
+        """The damped step (k, 6) of what all frames share, and that of the targets (f, 6)."""
+        ...
+
+    def moved(self, unknowns: Unknowns, shared: Array, targets: Array) -> Unknowns:
+        """The unknowns after a step."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimum(Generic[Unknowns]):
+    """Where the robust loss is least."""
+
+    unknowns: Unknowns
+    scale: float  # as Adjustment's
+    steps: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PosesOnly:
+    """The problem of adjust."""
+
+    sightings: Sightings
+    gauge: Gauge
+
+    @property
+    def dof(self) -> int:
+        return degrees_of_freedom(self.sightings, self.gauge)
+
+    def sums(self, unknowns: Poses, kappa: float) -> ViewSums:
+        return view_sums(self.sightings, unknowns, kappa)
+
+    def step(self, unknowns: Poses, sums: ViewSums, damping: float) -> tuple[Array, Array]:
+        return _solve(self.sightings, sums, self.gauge, damping)
+
+    def moved(self, unknowns: Poses, shared: Array, targets: Array) -> Poses:
+        return Poses(left_moved(unknowns.T_world_cam, shared), left_moved(unknowns.T_world_target, targets))
+
+
 def adjust(sightings: Sightings, start: Poses, gauge: Gauge) -> Adjustment:
     """Minimise the robust reprojection error over all poses that the gauge leaves free.
 
@@ -61,27 +117,30 @@ def adjust(sightings: Sightings, start: Poses, gauge: Gauge) -> Adjustment:
         start: Poses near the optimum.
         gauge: Fixed cameras and frames, at least one of them.
     """
-    poses = start
-    sums = view_sums(sightings, poses, np.inf)
-    dof = _dof(sightings, gauge)
-    steps = 0
-    for _ in range(RESCALINGS):
-        scale = _scale(sums.squares, dof)
-        poses, sums, took = _minimise(sightings, poses, gauge, KAPPA * scale)
-        steps += took
-        if abs(_scale(sums.squares, dof) - scale) < SETTLED_SCALE * scale:
-            break
-    scale = _scale(sums.squares, dof)
+    found = optimise(_PosesOnly(sightings, gauge), start)
     return Adjustment(
-        poses=poses,
-        residuals=residuals(sightings, poses),
-        scale=scale,
-        covariance=_covariance(sightings, poses, gauge, KAPPA * scale),
-        steps=steps,
+        poses=found.unknowns,
+        residuals=residuals(sightings, found.unknowns),
+        scale=found.scale,
+        covariance=_covariance(sightings, found.unknowns, gauge, KAPPA * found.scale),
+        steps=found.steps,
     )
 
 
-def _dof(sightings: Sightings, gauge: Gauge) -> int:
+def optimise(problem: Problem[Unknowns], start: Unknowns) -> Optimum[Unknowns]:
+    """The least robust loss near the start; its scale follows the residuals until both agree."""
+    unknowns, steps = start, 0
+    squares, dof = problem.sums(start, np.inf).squares, problem.dof
+    for _ in range(RESCALINGS):
+        scale = _scale(squares, dof)
+        unknowns, squares, took = _minimise(problem, unknowns, KAPPA * scale)
+        steps += took
+        if abs(_scale(squares, dof) - scale) < SETTLED_SCALE * scale:
+            break
+    return Optimum(unknowns, _scale(squares, dof), steps)
+
+
+def degrees_of_freedom(sightings: Sightings, gauge: Gauge) -> int:
     """Residuals beyond the unknowns."""
     seen = np.zeros(len(sightings.frames), dtype=bool)
     seen[sightings.view_frame] = True
@@ -95,26 +154,26 @@ def _scale(squares: Array, dof: int) -> float:
     return max(float(np.sqrt(np.median(squares) * absorbed)) / RAYLEIGH_MEDIAN, MIN_SCALE)
 
 
-def _minimise(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) -> tuple[Poses, ViewSums, int]:
-    """Levenberg-Marquardt with a fixed loss: the optimum near ``poses``, its sums, and the number of steps tried."""
-    sums = view_sums(sightings, poses, kappa)
+def _minimise(problem: Problem[Unknowns], unknowns: Unknowns, kappa: float) -> tuple[Unknowns, Array, int]:
+    """Levenberg-Marquardt with a fixed loss: the optimum near ``unknowns``, squared distances, steps tried."""
+    sums = problem.sums(unknowns, kappa)
     cost = _cost(sums.squares, kappa)
     damping = START_DAMPING
     for step in range(1, MAX_STEPS + 1):
-        d_cam, d_target = _solve(sightings, sums, gauge, damping)
-        moved = Poses(_moved(poses.T_world_cam, d_cam), _moved(poses.T_world_target, d_target))
-        tried = view_sums(sightings, moved, kappa)
+        shared, targets = problem.step(unknowns, sums, damping)
+        moved = problem.moved(unknowns, shared, targets)
+        tried = problem.sums(moved, kappa)
         tried_cost = _cost(tried.squares, kappa)
         if not tried_cost <= cost:
             damping *= 10
-            if damping > MAX_DAMPING or max(np.abs(d_cam).max(), np.abs(d_target).max()) < CONVERGED_STEP:
-                return poses, sums, step
+            if damping > MAX_DAMPING or max(np.abs(shared).max(), np.abs(targets).max()) < CONVERGED_STEP:
+                return unknowns, sums.squares, step
             continue
         done = cost - tried_cost <= CONVERGED_COST * cost
-        poses, sums, cost, damping = moved, tried, tried_cost, max(damping / 10, 1e-12)
+        unknowns, sums, cost, damping = moved, tried, tried_cost, max(damping / 10, 1e-12)
         if done:
-            return poses, sums, step
-    return poses, sums, MAX_STEPS
+            return unknowns, sums.squares, step
+    return unknowns, sums.squares, MAX_STEPS
 
 
 def _cost(squares: Array, kappa: float) -> float:
@@ -123,7 +182,7 @@ def _cost(squares: Array, kappa: float) -> float:
     return kappa**2 * cost if np.isfinite(cost) else np.inf
 
 
-def _moved(T: Pose, xi: Array) -> Pose:
+def left_moved(T: Pose, xi: Array) -> Pose:
     """Poses (k, 4, 4) after left steps (k, 6): to first order ``Exp(xi) @ T``, which is all that a step is good for."""
     R = exp_so3(xi[:, :3])
     moved = T.copy()
@@ -137,9 +196,9 @@ def _moved(T: Pose, xi: Array) -> Pose:
 def _solve(sightings: Sightings, system: ViewSums, gauge: Gauge, damping: float) -> tuple[Array, Array]:
     """The damped step of cameras (c, 6) and targets (f, 6)."""
     H_cam, g_cam, H_target, g_target, E = _blocks(sightings, system)
-    H_cam = _damped(H_cam, damping)
-    inverse = _inverse_targets(_damped(H_target, damping), gauge)
-    S, Y = _schur(H_cam, inverse, E)
+    H_cam = damped(H_cam, damping)
+    inverse = inverse_targets(damped(H_target, damping), gauge)
+    S, Y = schur(H_cam, inverse, E)
     right = g_cam.ravel() - np.einsum("fij,fj->i", Y, g_target)
     free = np.repeat(~gauge.fixed_cameras, 6)
     d_cam = np.zeros(len(free))
@@ -151,21 +210,28 @@ def _solve(sightings: Sightings, system: ViewSums, gauge: Gauge, damping: float)
 
 def _blocks(sightings: Sightings, system: ViewSums) -> tuple[Array, Array, Array, Array, Array]:
     """H and g of cameras and targets, and the coupling E (f, 6 c, 6)."""
-    n_cam, n_frame = len(sightings.cameras), len(sightings.frames)
-    view = (sightings.view_frame, sightings.view_camera)  # every pair is one view, or none
-    W, g = np.zeros((n_frame, n_cam, 6, 6)), np.zeros((n_frame, n_cam, 6))
-    W[view], g[view] = system.W, system.g
+    W, g = _by_frame(sightings, system)
+    n_frame, n_cam = W.shape[:2]
     E = -W.reshape(n_frame, 6 * n_cam, 6)
     # A camera's derivative is the target's with the other sign.
     return W.sum(axis=0), -g.sum(axis=0), W.sum(axis=1), g.sum(axis=1), E
 
 
-def _damped(H: Array, damping: float) -> Array:
+def _by_frame(sightings: Sightings, system: ViewSums) -> tuple[Array, Array]:
+    """W (f, c, 6, 6) and g (f, c, 6); every pair of a frame and a camera is one view, or none."""
+    n_cam, n_frame = len(sightings.cameras), len(sightings.frames)
+    view = (sightings.view_frame, sightings.view_camera)
+    W, g = np.zeros((n_frame, n_cam, 6, 6)), np.zeros((n_frame, n_cam, 6))
+    W[view], g[view] = system.W, system.g
+    return W, g
+
+
+def damped(H: Array, damping: float) -> Array:
     diagonal = np.einsum("kii->ki", H)
     return H + damping * np.maximum(diagonal, 1e-12)[:, :, None] * np.eye(6)
 
 
-def _inverse_targets(H_target: Array, gauge: Gauge) -> Array:
+def inverse_targets(H_target: Array, gauge: Gauge) -> Array:
     """Inverses of the targets' blocks; zero for fixed targets and for frames without a view."""
     seen = np.einsum("kii->k", H_target) > 1e-9
     free = seen & ~gauge.fixed_frames
@@ -174,7 +240,7 @@ def _inverse_targets(H_target: Array, gauge: Gauge) -> Array:
     return inverse
 
 
-def _schur(H_cam: Array, inverse: Array, E: Array) -> tuple[Array, Array]:
+def schur(H_cam: Array, inverse: Array, E: Array) -> tuple[Array, Array]:
     """The cameras' system (6c, 6c) after the targets are eliminated, and ``Y = E H_target^-1`` (f, 6c, 6)."""
     Y = E @ inverse
     n = E.shape[1]
@@ -189,21 +255,24 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
 
     For an M-estimator with psi(r) = w(r) r it is E[psi^2] / E[psi']^2 (X^T X)^-1 (Huber, "Robust statistics", 1981,
     ch. 7); for the Cauchy loss in two dimensions the mean of psi' is the mean of w^2, which here stays inside the
-    normal equations so that a view full of outliers counts little.
+    normal equations so that a view full of outliers counts little. Corners of a frame that err together repeat each
+    other, and count less.
     """
     system = view_sums(sightings, poses, kappa, power=2)
     H_cam, _, H_target, _, E = _blocks(sightings, system)
-    S, _ = _schur(H_cam, _inverse_targets(H_target, gauge), E)
+    S, Y = schur(H_cam, inverse_targets(H_target, gauge), E)
     free = np.repeat(~gauge.fixed_cameras, 6)
-    covariance = np.zeros_like(S)
+    P = np.zeros_like(S)
     if free.any():
         inverse = np.linalg.inv(S[np.ix_(free, free)])
-        variance = _variance(system.squares, _dof(sightings, gauge), kappa)
-        covariance[np.ix_(free, free)] = variance * (inverse + inverse.T) / 2
-    return covariance
+        P[np.ix_(free, free)] = (inverse + inverse.T) / 2
+    variance = residual_variance(system.squares, degrees_of_freedom(sightings, gauge), kappa)
+    W, _ = _by_frame(sightings, system)
+    _, g = _by_frame(sightings, view_sums(sightings, poses, kappa))
+    return variance * repetition(W, g, E, Y, P, variance) * P
 
 
-def _variance(squares: Array, dof: int, kappa: float) -> float:
+def residual_variance(squares: Array, dof: int, kappa: float) -> float:
     """Variance of a residual coordinate in the corners' variances, from the residuals and a little from the sigmas."""
     w2 = (1.0 + squares / kappa**2) ** -2
     return float(((w2 * squares).sum() + PRIOR_DOF) / (dof + PRIOR_DOF) / w2.mean())

@@ -24,12 +24,15 @@ from aruco.rig_estimate import Placement, RigEstimate
 from aruco.uncertainty import carried
 from rigcal.solve.adjust import Gauge
 from rigcal.solve.judge import MAX_VIEW_MEDIAN, Judged, adjust_judging, confirmed
+from rigcal.solve.model_noise import model_noise_px
 from rigcal.solve.problem import Poses, Sightings, gather, residuals
 
 # camera -> frame -> markers
 Detections = Mapping[str, Mapping[int, Detection]]
 # A marker whose median corner is this many times as far off as all corners is misprinted, moved, or wrong in the map.
 MAX_MARKER_MEDIAN = 5.0
+# Views that come back once the model noise is known may show more of it.
+NOISE_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,7 +41,9 @@ class JointRig:
 
     rig: RigEstimate
     covariance: Mapping[str, Array]  # camera -> (6, 6) of the left perturbation (rotation, translation), world axes
-    scale: float  # how many times larger residuals are than the corners' sigmas promise
+    scale: float  # how many times larger residuals are than the corners' sigmas and the model noise promise
+    noise_px: float  # model noise: what corners miss beyond their own sigmas
+    beyond_promise: float  # how many times larger residuals are than the corners' sigmas alone promise
     rejected: Mapping[str, tuple[int, ...]]  # placed camera -> frames whose view does not fit the others
     odd_markers: Mapping[int, float]  # marker -> its median corner over that of all corners, where that is large
     steps: int
@@ -71,7 +76,16 @@ def adjust_rig(
     )
     gauge = Gauge(np.zeros(len(placed), dtype=bool), np.array([frame == rig.world_frame for frame in sightings.frames]))
     judged = adjust_judging(sightings, start, gauge)
-    return _result(rig, sightings, judged, moving)
+    beyond_promise, total_px = judged.adjustment.scale, 0.0
+    for _ in range(NOISE_ROUNDS):
+        more_px = model_noise_px(sightings.only_views(judged.kept), judged.adjustment) if judged.kept.any() else 0.0
+        if not more_px:
+            break
+        total_px = float(np.hypot(total_px, more_px))
+        sightings = replace(sightings, sigma_px=np.hypot(sightings.sigma_px, more_px))
+        judged = adjust_judging(sightings, start, gauge)
+    result = _result(rig, sightings, judged, moving)
+    return replace(result, noise_px=total_px, beyond_promise=max(beyond_promise, result.scale))
 
 
 def _resting(rig: RigEstimate, detections: Detections) -> dict[str, dict[int, Detection]]:
@@ -122,6 +136,8 @@ def _result(rig: RigEstimate, sightings: Sightings, judged: Judged, moving: bool
         ),
         covariance={name: carried(blocks[c, :, c], T_new_world) for c, name in enumerate(names) if name not in lost},
         scale=adjustment.scale,
+        noise_px=0.0,
+        beyond_promise=adjustment.scale,
         rejected={name: frames for name, frames in rejected.items() if frames and name not in lost},
         odd_markers=_odd_markers(sightings, judged),
         steps=adjustment.steps,
