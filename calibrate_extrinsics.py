@@ -55,6 +55,9 @@ DOUBTFUL = 3  # exit code: poses were written, but not of every camera, or they 
               help="Leave out views with fewer markers.")  # fmt: skip
 @click.option("--joint/--no-joint", default=True, show_default=True,
               help="Adjust all cameras and frames together, with uncertainty; or keep the average.")  # fmt: skip
+@click.option("--fix", type=click.Path(path_type=Path), metavar="FILE",
+              help="An extrinsics file: its cameras stay where they are, to the bit, and the others of the recording "
+                   "are added in its world.")  # fmt: skip
 @click.option("--preview/--no-preview", default=False, show_default=True,
               help="Write annotated frames into a folder beside the output.")  # fmt: skip
 @click.option("--seed", type=int, default=0, show_default=True, help="For every random choice.")
@@ -73,6 +76,8 @@ def main(**given: Any) -> None:
         )
     if bool(given["markers"]) == bool(given["board"]):
         raise click.UsageError("give the target: --markers MAP.parquet, or --board SPEC, one of them")
+    if given["fix"] and given["auto_align"]:
+        raise click.UsageError("--fix keeps the world of its file, upright or not; leave out --auto-align")
     if not given["auto_align"] and (given["ground_face"] or given["ground_marker_id"] or given["up_axis"] != "+y"):
         click.echo("warning: --ground-face, --ground-marker-id and --up-axis do nothing without --auto-align", err=True)
     from rigcal import cli
@@ -89,7 +94,7 @@ def _run(given: dict[str, Any]) -> Calibration:
     from rigcal.formats import native
     from rigcal.pipeline import calibrate_files
 
-    cli.refuse_inputs(given["output"], [*given["svo"], *given["inputs"]], given["markers"])
+    cli.refuse_inputs(given["output"], [*given["svo"], *given["inputs"]], given["markers"], given["fix"])
     check_writable(given["output"])
     with cli.showing_progress() as progress:
         calibration = calibrate_files(
@@ -97,6 +102,7 @@ def _run(given: dict[str, Any]) -> Calibration:
             given["markers"],
             _config(given),
             board=given["board"],
+            fix=given["fix"],
             jobs=given["jobs"],
             progress=progress,
             preview=cli.preview_folder(given["output"]) if given["preview"] else None,

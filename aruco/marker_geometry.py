@@ -182,6 +182,17 @@ def _refuse_repeats(faces: Sequence[Face], path: Path) -> None:
             owners[marker] = face.name
 
 
+def corrected_faces(faces: Sequence[Face], geometry: Mapping[int, Array]) -> list[Face]:
+    """The same faces with the corners (4, 3) [m] that a geometry has for their markers."""
+    return [_with_corners(face, [geometry[marker] for marker in face.ids]) for face in faces]
+
+
+def _with_corners(face: Face, corners: Sequence[Array]) -> Face:
+    together: Array = np.array(corners, dtype=np.float64).reshape(-1, 4, 3)
+    together.setflags(write=False)
+    return Face(name=face.name, ids=face.ids, corners=together)
+
+
 def save_faces(path: str | os.PathLike[str], faces: Sequence[Face]) -> None:
     """Write a marker map whole or not at all.
 

@@ -206,6 +206,7 @@ class CameraPose:
     spread_rad: float
     covariance: Array | None = None  # (6, 6) of the left perturbation (rotation, translation), world axes
     least_known: str = ""  # the least observable direction in words; empty without a covariance
+    kept: bool = False  # stands where an earlier calibration put it, to the bit
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -236,6 +237,9 @@ class Calibration:
     up: UpAxis | None  # None: the world is the target's frame, whichever way that lies
     frames: Mapping[str, FrameCounts]
     notes: Mapping[str, Any] = field(default_factory=dict)  # further entries of _meta: aligned, sync, provenance
+    origin: str = "target"  # what the world's origin is tied to
+    unused: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # cameras of an earlier file: their entries
+    parts: tuple[Calibration, ...] = ()  # cameras that nothing connects with these, each group in a world of its own
 
     @property
     def T_world_cam(self) -> dict[str, Pose]:

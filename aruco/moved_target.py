@@ -8,7 +8,8 @@ The world is the target at its first well-seen frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -26,40 +27,47 @@ ENOUGH_FRAMES = 3
 Chosen = Mapping[int, Mapping[str, Candidate]]
 
 
-def place_cameras(views: Sequence[View], scale2: Mapping[str, float]) -> RigEstimate:
-    """Every camera's pose in the frame of the target at its first well-seen frame.
+def place_parts(
+    views: Sequence[View], scale2: Mapping[str, float], known: Mapping[str, Pose] | None = None
+) -> list[RigEstimate]:
+    """Every connected part of the rig, each in a world of its own.
 
     Args:
         views: Of all cameras; views of one moment share their frame index.
         scale2: Camera -> factor on the corners' variances, from the residuals of all its views.
+        known: T_world_cam of cameras that stay where they are: the first part is theirs, and its world.
 
     Returns:
-        The largest connected part of the rig, and why other cameras are not in it.
+        The part of the known cameras, or the largest, which also says why other cameras are not in it; then the other
+        parts of two and more cameras, the largest first. The world of a part without known cameras is the target at
+        its first well-seen frame.
     """
     by_camera = {name: {v.frame: v for v in views if v.camera == name} for name in sorted({v.camera for v in views})}
     pairs = combinations(by_camera, 2)
     links = [link for i, j in pairs if (link := link_cameras(by_camera[i], by_camera[j], scale2)) is not None]
-    T_root_cam = _chain(_best_tree(by_camera, links))
-    chosen = _choose(views, T_root_cam, scale2)
-    lost = {name: _why_lost(name, by_camera, links) for name in by_camera if name not in T_root_cam}
-    if not chosen or (len(T_root_cam) == 1 and len(by_camera) > 1):
-        lost |= {name: _why_lost(name, by_camera, links) for name in T_root_cam}
-        return RigEstimate(cameras={}, lost=lost, T_world_target={})
-    T_root_target = {frame: _target(chosen[frame], T_root_cam, scale2) for frame in chosen}
-    world_frame = _first_well_seen(chosen)
-    T_world_root = invert_transform(T_root_target[world_frame])
-    T_world_cam = {name: T_world_root @ T for name, T in T_root_cam.items()}
-    return RigEstimate(
-        cameras={name: _placement(name, T_world_cam, chosen, by_camera[name], scale2) for name in T_world_cam},
-        lost=lost,
-        T_world_target={frame: T_world_root @ T for frame, T in T_root_target.items()},
-        world_frame=world_frame,
-    )
+    roots = {name: T for name, T in (known or {}).items() if name in by_camera}
+    parts = _best_trees(by_camera, links, roots)
+    rigs = [_rig(names, tree, roots, by_camera, scale2) for names, tree in parts]
+    first = rigs[0] if rigs[0].cameras and (len(rigs[0].cameras) > 1 or len(by_camera) == 1) else _NOTHING
+    lost = {name: _why_lost(name, by_camera, links) for name in by_camera if name not in first.cameras}
+    others = [rig for rig in rigs[1:] if len(rig.cameras) > 1]
+    return [replace(first, lost=lost), *others]
 
 
-def _best_tree(cameras: Iterable[str], links: Sequence[CameraLink]) -> list[CameraLink]:
-    """The strongest spanning tree of the largest connected part (Kruskal): its links, strongest first."""
-    part = {name: {name} for name in cameras}
+_NOTHING = RigEstimate(cameras={}, lost={}, T_world_target={})
+
+
+def place_cameras(views: Sequence[View], scale2: Mapping[str, float]) -> RigEstimate:
+    """The largest connected part of the rig, and why other cameras are not in it; see place_parts."""
+    return place_parts(views, scale2)[0]
+
+
+def _best_trees(
+    cameras: Iterable[str], links: Sequence[CameraLink], known: Collection[str]
+) -> list[tuple[list[str], list[CameraLink]]]:
+    """Every connected part, that of the known cameras or the largest first: names, and its strongest tree (Kruskal)."""
+    together = set(known)
+    part = {name: together if name in together else {name} for name in cameras}
     tree: list[CameraLink] = []
 
     def order(link: CameraLink) -> tuple[int, float, str, str]:
@@ -68,21 +76,17 @@ def _best_tree(cameras: Iterable[str], links: Sequence[CameraLink]) -> list[Came
     for link in sorted(links, key=order):
         if part[link.i] is not part[link.j]:
             merged = part[link.i] | part[link.j]
-            for name in merged:
-                part[name] = merged
+            part.update(dict.fromkeys(merged, merged))
             tree.append(link)
-    largest = min(part.values(), key=lambda names: (-len(names), min(names)))
-    return [link for link in tree if link.i in largest] or [_alone(min(largest))]
+    parts = sorted({tuple(sorted(names)) for names in part.values()}, key=lambda p: (-len(p), p))
+    parts.sort(key=lambda names: together.isdisjoint(names))
+    return [(list(names), [link for link in tree if link.i in names]) for names in parts]
 
 
-def _alone(camera: str) -> CameraLink:
-    """A tree of one camera: a link to itself."""
-    return CameraLink(i=camera, j=camera, average=average_poses([np.eye(4)]), frames=())
-
-
-def _chain(tree: Sequence[CameraLink]) -> dict[str, Pose]:
-    """T_root_cam of every camera of a tree; the root is an end of its strongest link."""
-    T_root_cam: dict[str, Pose] = {tree[0].i: np.eye(4)}
+def _chain(names: Sequence[str], tree: Sequence[CameraLink], known: Mapping[str, Pose]) -> dict[str, Pose]:
+    """T_root_cam of every camera of a tree; the root is an end of its strongest link, or the known cameras' world."""
+    known = {name: known[name] for name in names if name in known}
+    T_root_cam: dict[str, Pose] = dict(known) or {(tree[0].i if tree else names[0]): np.eye(4)}
     waiting = list(tree)
     while waiting:
         link = next(k for k in waiting if k.i in T_root_cam or k.j in T_root_cam)
@@ -92,6 +96,30 @@ def _chain(tree: Sequence[CameraLink]) -> dict[str, Pose]:
         else:
             T_root_cam[link.i] = T_root_cam[link.j] @ invert_transform(link.average.T)
     return dict(sorted(T_root_cam.items()))
+
+
+def _rig(
+    names: Sequence[str],
+    tree: Sequence[CameraLink],
+    known: Mapping[str, Pose],
+    by_camera: Mapping[str, Mapping[int, View]],
+    scale2: Mapping[str, float],
+) -> RigEstimate:
+    """One part in its world; without a camera where its views leave the target's pose open in every frame."""
+    T_root_cam = _chain(names, tree, known)
+    chosen = _choose([view for name in names for view in by_camera[name].values()], T_root_cam, scale2)
+    if not chosen:
+        return _NOTHING
+    T_root_target = {frame: _target(chosen[frame], T_root_cam, scale2) for frame in chosen}
+    world_frame = _first_well_seen(chosen)
+    T_world_root = np.eye(4) if known.keys() & set(names) else invert_transform(T_root_target[world_frame])
+    T_world_cam = {name: T_world_root @ T for name, T in T_root_cam.items()}
+    return RigEstimate(
+        cameras={name: _placement(name, T_world_cam, chosen, by_camera[name], scale2) for name in T_world_cam},
+        lost={},
+        T_world_target={frame: T_world_root @ T for frame, T in T_root_target.items()},
+        world_frame=world_frame,
+    )
 
 
 def _choose(

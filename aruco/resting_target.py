@@ -11,6 +11,7 @@ averaged over all frames have less noise, and what rivals remain are those of th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,8 +41,9 @@ def place_cameras(
     detections: Mapping[str, Mapping[int, Detection]],
     geometry: Mapping[int, Array],
     scale2: Mapping[str, float],
+    known: Mapping[str, Pose] | None = None,
 ) -> RigEstimate:
-    """Every camera's pose in the frame of a target that rests.
+    """Every camera's pose in the frame of a target that rests, or in the world of known cameras.
 
     Args:
         cameras: Those of the recording.
@@ -49,9 +51,11 @@ def place_cameras(
         detections: Camera -> frame -> markers, at least for the frames of the views.
         geometry: Marker id -> (k, 3) points [m], target frame.
         scale2: Camera -> factor on the corners' variances, from the residuals of all its views.
+        known: T_world_cam of cameras that stay where they are.
 
     Returns:
-        The cameras that could be placed, and why the others could not.
+        The cameras that could be placed, and why the others could not; none when there are known cameras and none of
+        them could be placed.
 
     Raises:
         CalibrationError: The corners do not stay where they are: the target did not rest.
@@ -77,7 +81,22 @@ def place_cameras(
             (lost if isinstance(result, str) else placed)[camera.name] = result  # pyright: ignore[reportArgumentType]
     frames = sorted({frame for placement in placed.values() for frame in placement.frames})
     targets = {frame: np.eye(4) for frame in frames}
-    return RigEstimate(cameras=placed, lost=lost, T_world_target=targets, world_frame=frames[0] if frames else 0)
+    rig = RigEstimate(cameras=placed, lost=lost, T_world_target=targets, world_frame=frames[0] if frames else 0)
+    return rig if not known else _in_their_world(rig, known)
+
+
+def _in_their_world(rig: RigEstimate, known: Mapping[str, Pose]) -> RigEstimate:
+    """The rig moved to where known cameras stand, and these put exactly there."""
+    fixed = {name: known[name] for name in rig.cameras if name in known}
+    if not fixed:
+        reason = "no camera that is to stay where it is could be placed by this recording"
+        return replace(rig, cameras={}, lost={**rig.lost, **dict.fromkeys(rig.cameras, reason)}, T_world_target={})
+    T_world_target = average_poses([T @ invert_transform(rig.cameras[n].T_world_cam) for n, T in fixed.items()]).T
+    cameras = {
+        name: replace(placement, T_world_cam=fixed.get(name, T_world_target @ placement.T_world_cam))
+        for name, placement in rig.cameras.items()
+    }
+    return replace(rig, cameras=cameras, T_world_target=dict.fromkeys(rig.T_world_target, T_world_target))
 
 
 def _require_rest(resting: Mapping[str, Sequence[int]], n_views: int) -> None:

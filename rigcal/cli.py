@@ -36,15 +36,17 @@ def telling_errors(*, debug: bool) -> Iterator[None]:
         raise click.ClickException("interrupted.") from None
 
 
-def refuse_inputs(output: Path, recordings: Sequence[Path], markers: Path | None) -> None:
+def refuse_inputs(output: Path, recordings: Sequence[Path], markers: Path | None, kept: Path | None = None) -> None:
     """An output must not replace what it is made from.
 
     Raises:
-        OutputError: It is the marker map, or lies inside a camera's folder.
+        OutputError: It is the marker map or the file of kept cameras, or lies inside a camera's folder.
     """
     goal = output.resolve()
     if markers is not None and goal == markers.resolve():
         raise OutputError(f"{output}: is the marker map, an input; give --output another name.")
+    if kept is not None and goal == kept.resolve():
+        raise OutputError(f"{output}: is the file of the cameras to keep, an input; give --output another name.")
     if goal.exists() and any(goal == path.resolve() for path in recordings):
         raise OutputError(f"{output}: is a recording, an input; give --output another name.")
     for path in recordings:

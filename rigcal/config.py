@@ -59,6 +59,7 @@ class CalibrateConfig:
     moving_target: bool = False
     still: bool = False  # use the stretches in which the target rests instead of single frames
     joint: bool = True  # adjust all cameras and frames together after the average
+    refine_target: bool = False  # estimate the places of the target's markers too
     seed: int = 0
 
     @property

@@ -81,6 +81,27 @@ def require_views(recording: Recording, target: Target, config: DetectConfig, se
     )
 
 
+def require_kept(recording: Recording, seen: Mapping[str, Seen], kept: Collection[str]) -> None:
+    """Go on only if a camera that is to stay where it is sees the target, so that the others can be tied to it.
+
+    Raises:
+        CalibrationError: There are such cameras, but none in the recording, or none sees the target.
+    """
+    here = [camera.name for camera in recording.cameras if camera.name in kept]
+    if not kept or any(seen[name].views for name in here):
+        return
+    if not here:
+        names = ", ".join(camera.name for camera in recording.cameras)
+        raise CalibrationError(
+            f"No camera of the file to keep ({', '.join(sorted(kept))}) is in the recording ({names}): record at least "
+            "one of them together with the new ones."
+        )
+    raise CalibrationError(
+        f"Of the cameras to keep, none sees the target ({', '.join(here)}): put it where one of them and a new one "
+        "both see it."
+    )
+
+
 def _no_board(target: Target, images: list[NDArray]) -> str:
     from aruco.board_detector import BoardDetector
 

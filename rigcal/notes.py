@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from aruco.model import Recording
 from rigcal import __version__
-from rigcal.config import CalibrateConfig
 from rigcal.detecting import Seen, digest_of
+from rigcal.evidence import Evidence
 from rigcal.frames import Moments
+from rigcal.kept import KeptRig
 from rigcal.solve.joint import JointRig
-from rigcal.target import Target
 
 
 def frame_counts(seen: Mapping[str, Seen]) -> dict[str, Any]:
@@ -53,13 +52,12 @@ def adjustment(joint: JointRig) -> dict[str, Any]:
     }
 
 
-def provenance(
-    recording: Recording, target: Target, config: CalibrateConfig, seen: Mapping[str, Seen]
-) -> dict[str, Any]:
+def provenance(evidence: Evidence, kept: KeptRig) -> dict[str, Any]:
     """Version, every option that changes the result, and hashes of the inputs."""
-    inputs = {camera.name: digest_of(seen[camera.name], camera) for camera in recording.cameras}
+    inputs = {camera.name: digest_of(evidence.seen[camera.name], camera) for camera in evidence.cameras}
+    fixed = {"fixed_cameras": kept.digest} if kept.digest else {}
     return {
         "rigcal": __version__,
-        "options": config.as_dict(),
-        "inputs_sha256": {"target": target.digest, "cameras": inputs},
+        "options": evidence.config.as_dict(),
+        "inputs_sha256": {"target": evidence.target.digest, "cameras": inputs, **fixed},
     }

@@ -12,30 +12,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from loguru import logger
 
 from aruco import alignment, moved_target, resting_target
 from aruco.errors import CalibrationError
 from aruco.marker_geometry import Face
-from aruco.model import SILENT, Calibration, Camera, CameraPose, Detection, Progress, Recording
+from aruco.model import SILENT, Calibration, CameraPose, Progress, Recording
 from aruco.moved_alignment import find_up_moved
-from aruco.pose_math import Array, Pose, make_pose
+from aruco.pose_math import Pose, make_pose
 from aruco.reprojection import Reprojection, reproject
 from aruco.rig_estimate import RigEstimate
-from aruco.still import merge_stretches, still_stretches
 from aruco.uncertainty import camera_sigma, carried, least_known
-from aruco.view_pose import solve_view, variance_factor
 from rigcal import diagnosis, notes
 from rigcal.config import AlignConfig, CalibrateConfig, Resources
-from rigcal.detecting import OnFrame, Seen, watch
-from rigcal.frames import Moments, each_alone, synchronised
+from rigcal.detecting import OnFrame, Seen
+from rigcal.evidence import Evidence, at_rest, look
+from rigcal.kept import KeptRig, kept_from_file
 from rigcal.preview_writer import PreviewWriter
 from rigcal.quality.gates import Quality
-from rigcal.solve.graph import graph_health
+from rigcal.solve.graph import GraphHealth, graph_health
 from rigcal.solve.joint import JointRig, adjust_rig
 from rigcal.sources import open_recordings
 from rigcal.target import Target, board_target, marker_target_from_file
 from rigcal.validation import validate
 from rigcal.verdict import depth_below_target, quality_of
+
+NOTHING_KEPT = KeptRig(T_world_cam={})
 
 
 def calibrate(
@@ -43,6 +45,7 @@ def calibrate(
     target: Target,
     config: CalibrateConfig,
     *,
+    kept: KeptRig = NOTHING_KEPT,
     resources: Resources | None = None,
     progress: Progress = SILENT,
     on_frame: OnFrame | None = None,
@@ -53,6 +56,7 @@ def calibrate(
         recording: Synchronised or to be synchronised images of one or more cameras.
         target: What stands in them.
         config: What changes the result.
+        kept: Cameras that stay where an earlier calibration put them; their world is that of the result.
         resources: What changes only time and memory.
         progress: Is told how far the long steps have come.
         on_frame: Is called with every image that was read, from several threads.
@@ -61,41 +65,26 @@ def calibrate(
         InputError: The recording or an option cannot be used.
         CalibrationError: No camera could be placed, or up is ambiguous.
     """
-    moments = (each_alone if config.still else synchronised)(recording, config.frames)
     jobs = (resources or Resources()).jobs
-    seen = watch(
-        recording,
-        moments,
-        target,
-        min_markers=config.detect.min_markers,
-        jobs=jobs,
-        progress=progress,
-        on_frame=on_frame,
-    )
-    diagnosis.require_views(recording, target, config.detect, seen)
+    evidence = look(recording, target, config, jobs=jobs, progress=progress, on_frame=on_frame)
+    diagnosis.require_views(recording, target, config.detect, evidence.seen)
     if config.still:
-        seen = still_moments(recording, target, moments, seen)
-    rig = place_cameras(recording.cameras, seen, target.geometry, moving=config.target_moves)
-    average = rig
-    joint = adjust(rig, recording, seen, target, config) if config.joint else None
-    rig = rig if joint is None else joint.rig
-    used = {name: {f: seen[name].detections[f] for f in p.frames} for name, p in rig.cameras.items()}
-    residuals = reproject({camera.name: camera for camera in recording.cameras}, rig, used, target.geometry)
-    rig = diagnosis.refuse_misfits(rig, residuals, recording.cameras)
-    T_aligned_world, aligned = align(rig, target.faces, config.align, moving=config.target_moves)
-    rig = rig.turned(T_aligned_world[:3, :3])
-    about: dict[str, Any] = {"frames": notes.frame_counts(seen), "sync": notes.clock(moments)}
-    if joint is not None:
-        about["adjusted"] = notes.adjustment(joint)
-        about["quality"] = assess(average, joint, rig, recording, seen, target, config).as_dict()
-    if len(seen) > 1 and config.moving_target:
-        about["connections"] = graph_health({name: s.detections for name, s in seen.items()}).as_dict()
-    return Calibration(
-        cameras=_camera_poses(rig, seen, residuals, joint, T_aligned_world, config.align),
-        lost={**diagnosis.cameras_without_views(recording, moments.sync, seen), **rig.lost},
-        up=config.align.up_axis if config.align.enabled else None,
-        frames={name: s.counts for name, s in seen.items()},
-        notes={**aligned, **about, "provenance": notes.provenance(recording, target, config, seen)},
+        evidence = at_rest(evidence)
+    health = _connections(evidence)
+    first, *others = place_cameras(evidence, kept)
+    calibration = finish(first, evidence, kept)
+    about = {
+        "frames": notes.frame_counts(evidence.seen),
+        "sync": notes.clock(evidence.moments),
+        **({} if health is None else {"connections": health.as_dict()}),
+        "provenance": notes.provenance(evidence, kept),
+    }
+    return replace(
+        calibration,
+        lost={**diagnosis.cameras_without_views(recording, evidence.moments.sync, evidence.seen), **calibration.lost},
+        frames={name: s.counts for name, s in evidence.seen.items()},
+        notes={**calibration.notes, **about},
+        parts=tuple(part for rig in others if (part := _other_part(rig, evidence)) is not None),
     )
 
 
@@ -105,6 +94,7 @@ def calibrate_files(
     config: CalibrateConfig,
     *,
     board: str | None = None,
+    fix: Path | None = None,
     jobs: int | None = None,
     progress: Progress = SILENT,
     preview: Path | None = None,
@@ -117,88 +107,95 @@ def calibrate_files(
         target = board_target(board)
     if config.align.enabled:
         alignment.specified_face(target.faces, config.align.ground_face, config.align.ground_marker_id)
+    kept = NOTHING_KEPT if fix is None else kept_from_file(fix)
     recording = open_recordings(paths)
     on_frame = None if preview is None else PreviewWriter(preview, target.geometry)
     resources = Resources() if jobs is None else Resources(jobs=jobs)
-    return calibrate(recording, target, config, resources=resources, progress=progress, on_frame=on_frame)
+    return calibrate(recording, target, config, kept=kept, resources=resources, progress=progress, on_frame=on_frame)
 
 
-def still_moments(recording: Recording, target: Target, moments: Moments, seen: Mapping[str, Seen]) -> dict[str, Seen]:
-    """What was seen, with the stretches in which the target rests in the place of single frames.
-
-    Raises:
-        CalibrationError: It never rests.
-    """
-    tracks = {
-        name: [(moments.stamp_ns(recording, name, f), detection) for f, detection in sorted(s.detections.items())]
-        for name, s in seen.items()
-    }
-    stretches = still_stretches(tracks)
-    if not stretches:
-        raise CalibrationError(
-            "The target never rests for 0.3 s while a camera sees it: put it down for a moment wherever two cameras "
-            "see it, or leave out --still."
-        )
-    merged = merge_stretches(tracks, stretches)
-    models = {camera.name: camera for camera in recording.cameras}
-    return {name: _at_stretches(s, models[name], merged[name], target.geometry) for name, s in seen.items()}
+def _connections(evidence: Evidence) -> GraphHealth | None:
+    """Who sees the moved target together with whom, said before anything is solved."""
+    if not evidence.config.target_moves or len(evidence.seen) < 2:
+        return None
+    health = graph_health({name: s.detections.keys() for name, s in evidence.seen.items()})
+    logger.info(health.summary)
+    if health.suggestion:
+        logger.warning(health.suggestion)
+    return health
 
 
-def _at_stretches(seen: Seen, camera: Camera, merged: Mapping[int, Detection], geometry: Mapping[int, Array]) -> Seen:
-    views = [solve_view(camera, number, detection, geometry) for number, detection in merged.items()]
-    return replace(seen, detections=merged, views=tuple(view for view in views if view is not None))
-
-
-def place_cameras(
-    cameras: Sequence[Camera], seen: Mapping[str, Seen], geometry: Mapping[int, Array], *, moving: bool
-) -> RigEstimate:
-    """The rig, from the views of a target that rests or is moved.
+def place_cameras(evidence: Evidence, kept: KeptRig) -> list[RigEstimate]:
+    """The rig from averaged views; of a moved target also the parts that nothing connects with the first.
 
     Raises:
         CalibrationError: No camera could be placed, or a target that should rest was moved.
     """
-    views = [view for s in seen.values() for view in s.views]
-    scale2 = {name: variance_factor(s.views) for name, s in seen.items() if s.views}
-    if moving:
-        rig = moved_target.place_cameras(views, scale2)
+    views, scale2, known = evidence.views, evidence.scale2, kept.T_world_cam
+    diagnosis.require_kept(evidence.recording, evidence.seen, known)
+    if evidence.config.target_moves:
+        rigs = moved_target.place_parts(views, scale2, known)
     else:
-        detections = {name: s.detections for name, s in seen.items()}
-        rig = resting_target.place_cameras(cameras, views, detections, geometry, scale2)
-    if not rig.cameras:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in rig.lost.items())
+        geometry = evidence.target.geometry
+        detections = evidence.detections
+        rigs = [resting_target.place_cameras(evidence.cameras, views, detections, geometry, scale2, known)]
+    if not rigs[0].cameras:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in rigs[0].lost.items())
         raise CalibrationError(f"No camera could be placed. {reasons}.")
-    return rig
+    return rigs
 
 
-def adjust(
-    rig: RigEstimate, recording: Recording, seen: Mapping[str, Seen], target: Target, config: CalibrateConfig
-) -> JointRig:
-    """All cameras and frames together, from the average on."""
-    detections = {name: s.detections for name, s in seen.items()}
-    moving = config.target_moves
-    return adjust_rig(rig, recording.cameras, detections, target.geometry, moving=moving)
+def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> Calibration:
+    """One connected part of the rig: adjusted, checked, turned upright if that is wished.
 
-
-def assess(
-    average: RigEstimate,
-    joint: JointRig,
-    rig: RigEstimate,
-    recording: Recording,
-    seen: Mapping[str, Seen],
-    target: Target,
-    config: CalibrateConfig,
-) -> Quality:
-    """The verdict, from what was held out; ``rig`` is the finished one, in its upright world if it has one."""
-    validation = validate(
-        average,
-        joint,
-        recording.cameras,
-        {name: s.detections for name, s in seen.items()},
-        target.geometry,
-        moving=config.target_moves,
+    Raises:
+        CalibrationError: The views contradict each other, or up is ambiguous.
+    """
+    config, target = evidence.config, evidence.target
+    moving, fixed = config.target_moves, kept.T_world_cam.keys()
+    joint = None
+    if config.joint:
+        seen = evidence.detections
+        joint = adjust_rig(average, evidence.cameras, seen, target.geometry, moving=moving, fixed=fixed)
+    rig = average if joint is None else joint.rig
+    used = {name: {f: evidence.seen[name].detections[f] for f in p.frames} for name, p in rig.cameras.items()}
+    residuals = reproject({camera.name: camera for camera in evidence.cameras}, rig, used, target.geometry)
+    rig = diagnosis.refuse_misfits(rig, residuals, evidence.cameras)
+    T_aligned_world, about = align(rig, target.faces, config.align, moving=moving)
+    rig = rig.turned(T_aligned_world[:3, :3])
+    if joint is not None:
+        about["adjusted"] = notes.adjustment(joint)
+        about["quality"] = assess(average, joint, rig, evidence).as_dict()
+    unmoved = kept if fixed & rig.cameras.keys() else NOTHING_KEPT
+    for name in fixed & rig.lost.keys():
+        logger.warning("camera {} keeps its pose, but took no part: {}", name, rig.lost[name])
+    return Calibration(
+        cameras=_camera_poses(rig, evidence.seen, residuals, joint, T_aligned_world, config.align, unmoved),
+        lost={name: reason for name, reason in rig.lost.items() if name not in unmoved.T_world_cam},
+        up=config.align.up_axis if config.align.enabled else unmoved.up,
+        origin=str(unmoved.world.get("origin", "target")),
+        frames={name: evidence.seen[name].counts for name in rig.cameras},
+        notes=about,
+        unused={name: entry for name, entry in unmoved.entries.items() if name not in rig.cameras},
     )
+
+
+def _other_part(rig: RigEstimate, evidence: Evidence) -> Calibration | None:
+    """A part that nothing connects with the first, in a world of its own; its failure costs the first nothing."""
+    try:
+        return finish(rig, evidence, NOTHING_KEPT)
+    except CalibrationError as error:
+        logger.warning("cameras {} could not be placed on their own: {}", ", ".join(rig.cameras), error)
+        return None
+
+
+def assess(average: RigEstimate, joint: JointRig, rig: RigEstimate, evidence: Evidence) -> Quality:
+    """The verdict, from what was held out; ``rig`` is the finished one, in its upright world if it has one."""
+    config, geometry = evidence.config, evidence.target.geometry
+    seen = evidence.detections
+    validation = validate(average, joint, evidence.cameras, seen, geometry, moving=config.target_moves)
     up = (0, 1 if config.align.up_axis == "+y" else -1, 0)
-    below = depth_below_target(rig, target.geometry, up=up) if config.align.enabled else None
+    below = depth_below_target(rig, geometry, up=up) if config.align.enabled else None
     return quality_of(validation, below_target_m=below)
 
 
@@ -222,13 +219,6 @@ def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, movin
     return make_pose(aligned.R_align, np.zeros(3)), {"aligned": note}
 
 
-def _least_known(name: str, joint: JointRig, seen: Seen) -> str:
-    """The least observable direction of a camera in words; turns count at the distance of the target."""
-    sigma = camera_sigma(joint.covariance[name], joint.rig.cameras[name].T_world_cam)
-    reach_m = float(np.median([np.linalg.norm(view.best.T_cam_target[:3, 3]) for view in seen.views]))
-    return least_known(name, sigma, reach_m)
-
-
 def _camera_poses(
     rig: RigEstimate,
     seen: Mapping[str, Seen],
@@ -236,9 +226,12 @@ def _camera_poses(
     joint: JointRig | None,
     T_aligned_world: Pose,
     config: AlignConfig,
+    kept: KeptRig,
 ) -> tuple[CameraPose, ...]:
     """The finished cameras, in order of their names."""
     up = np.array([0.0, 1.0 if config.up_axis == "+y" else -1.0, 0.0]) if config.enabled else None
+    unmoved = kept.T_world_cam
+    known = {} if joint is None else {n: S for n, S in joint.covariance.items() if n not in unmoved}
     return tuple(
         CameraPose(
             camera=name,
@@ -248,9 +241,17 @@ def _camera_poses(
             rms_px=residuals[name].rms_px,
             spread_m=placement.spread_m,
             spread_rad=placement.spread_rad,
-            covariance=None if joint is None else carried(joint.covariance[name], T_aligned_world),
-            least_known="" if joint is None else _least_known(name, joint, seen[name]),
+            covariance=carried(known[name], T_aligned_world) if name in known else kept.covariance.get(name),
+            least_known=_least_known(name, rig, known[name], T_aligned_world, seen[name]) if name in known else "",
+            kept=name in unmoved,
             warnings=tuple(diagnosis.warnings(placement, residuals[name], seen[name], up)),
         )
         for name, placement in sorted(rig.cameras.items())
     )
+
+
+def _least_known(name: str, rig: RigEstimate, covariance: np.ndarray, T_aligned_world: Pose, seen: Seen) -> str:
+    """The least observable direction of a camera in words; turns count at the distance of the target."""
+    sigma = camera_sigma(carried(covariance, T_aligned_world), rig.cameras[name].T_world_cam)
+    reach_m = float(np.median([np.linalg.norm(view.best.T_cam_target[:3, 3]) for view in seen.views]))
+    return least_known(name, sigma, reach_m)

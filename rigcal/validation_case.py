@@ -39,10 +39,12 @@ class Case:
     poses: Poses  # the optimum
 
     def gauge(self, *, cameras: bool = False) -> Gauge:
-        """The first camera carries the world of a moved target; the target that of one at rest; or all cameras."""
-        fixed = np.full(len(self.cameras), cameras)
-        fixed[:1] |= self.moving
-        return Gauge(fixed, np.full(len(self.sightings.frames), not self.moving))
+        """Cameras that were kept carry the world; else the first of a moved target, the target at rest; or all."""
+        kept = np.array([camera.name in self.joint.fixed for camera in self.cameras], dtype=bool)
+        resting = not self.moving and not kept.any()
+        if not (kept.any() or resting):
+            kept[:1] = True
+        return Gauge(kept | cameras, np.full(len(self.sightings.frames), resting))
 
 
 def case_of(

@@ -39,7 +39,7 @@ def quality_of(validation: Validation, *, below_target_m: Mapping[str, float] | 
         validation: The numbers.
         below_target_m: In an upright world, camera -> how far it stands below the target (``depth_below_target``).
     """
-    v = validation
+    v, joint = validation, validation.adjusted
     readings = [
         *_sigmas(v),
         *_residuals(v),
@@ -48,13 +48,14 @@ def quality_of(validation: Validation, *, below_target_m: Mapping[str, float] | 
         *_splits(v, v.odd_even, "split-half", "Odd and even frames"),
         *_splits(v, v.early_late, "early-late", "The first and the second half of the recording"),
         *_views(v),
+        *_kept(v),
         *_heights(below_target_m or {}),
     ]
     return judge(
         Measured(
             readings=readings,
-            cameras=tuple(v.adjusted.rig.cameras),
-            lost=v.adjusted.rig.lost,
+            cameras=tuple(joint.rig.cameras),
+            lost={name: why for name, why in joint.rig.lost.items() if name not in joint.fixed},
             checked=checked_cameras(v),
             to_get_checked=_to_get_checked(v),
             pattern=v.patterns.clearest,
@@ -217,6 +218,19 @@ def _views(v: Validation) -> Iterator[Reading]:
             "both see it and record more."
         )
         yield Reading(gate="frames of the weakest link", value=float(link.n_shared), sentence=sentence)
+
+
+def _kept(v: Validation) -> Iterator[Reading]:
+    if not v.adjusted.fixed:
+        return
+    lost = {name: why for name, why in v.adjusted.rig.lost.items() if name not in v.rig.lost}
+    misfits = {name: why for name, why in lost.items() if name in v.adjusted.fixed}
+    told = "; ".join(f"camera {name} ({why})" for name, why in misfits.items())
+    sentence = (
+        f"No longer where the file to keep puts it: {told}; if it was moved since, take it out of that file and run "
+        "again, which places it anew."
+    )
+    yield Reading(gate="kept cameras that no longer fit", value=float(len(misfits)), sentence=sentence)
 
 
 def _rejected(v: Validation, name: str) -> tuple[int, ...]:

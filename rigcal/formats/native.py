@@ -26,14 +26,17 @@ UP_VECTORS: dict[UpAxis, list[int]] = {"+y": [0, 1, 0], "-y": [0, -1, 0]}
 
 def document(calibration: Calibration) -> dict[str, Any]:
     """The content of an extrinsics file."""
-    world = {"up": UP_VECTORS[calibration.up] if calibration.up else None, "origin": "target"}
+    world = {"up": UP_VECTORS[calibration.up] if calibration.up else None, "origin": calibration.origin}
     meta = {"format": FORMAT, "version": VERSION, "world": world, **calibration.notes}
     known = {c.camera: c.covariance for c in calibration.cameras if c.covariance is not None}
     if known:
         meta["covariance"] = {name: [float(x) for x in covariance.ravel()] for name, covariance in known.items()}
     if calibration.lost:
         meta["without_pose"] = dict(calibration.lost)
-    return {**{camera.camera: _entry(camera) for camera in calibration.cameras}, "_meta": meta}
+    if calibration.parts:
+        meta["parts"] = [document(part) for part in calibration.parts]
+    cameras = {camera.camera: _entry(camera) for camera in calibration.cameras}
+    return {**dict(sorted({**calibration.unused, **cameras}.items())), "_meta": meta}
 
 
 def _entry(camera: CameraPose) -> dict[str, Any]:
@@ -45,6 +48,7 @@ def _entry(camera: CameraPose) -> dict[str, Any]:
         "spread_mm": 1e3 * camera.spread_m,
         "spread_deg": math.degrees(camera.spread_rad),
         **({"least_known": camera.least_known} if camera.least_known else {}),
+        **({"kept": True} if camera.kept else {}),
         "warnings": list(camera.warnings),
     }
 

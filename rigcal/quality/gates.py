@@ -102,6 +102,8 @@ GATES: dict[str, Gate] = {
         Gate("rejected views", "percent", 15.0, 60.0),
         # The pose is that of one part of the recording, and nobody knows which part is true now.
         Gate("cameras moved while recorded", "", 0.0, 0.0),
+        # They carry the world: one that has moved bends everything that is tied to it.
+        Gate("kept cameras that no longer fit", "", 0.0, 0.0),
         # The adjustment resolves ambiguous views by others, as long as there are others.
         Gate("ambiguous views", "percent", 90.0, math.inf),
         # Corners of markers that lie five times as far off as others show a map that is wrong there.

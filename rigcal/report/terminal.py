@@ -31,9 +31,15 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
             out.print(f"warning: camera {camera.camera}: {warning}", markup=False)
     for name, reason in calibration.lost.items():
         out.print(f"no pose: camera {name}: {reason}", markup=False)
+    for name in calibration.unused:
+        out.print(f"kept: camera {name}: as its file says, not seen by this recording", markup=False)
     _show_clock(out, calibration)
     _show_verdict(out, calibration)
     out.print(_world(calibration), markup=False)
+    for part in calibration.parts:
+        names = ", ".join(camera.camera for camera in part.cameras)
+        out.print(f"\nNot connected with these: cameras {names}, in a world of their own (_meta.parts)", markup=False)
+        show_calibration(out, part)
 
 
 def _table(calibration: Calibration) -> Table:
@@ -42,7 +48,7 @@ def _table(calibration: Calibration) -> Table:
 
     table = Table(title="Cameras", title_justify="left")
     table.add_column("camera")
-    adjusted = any(camera.covariance is not None for camera in calibration.cameras)
+    adjusted = any(camera.covariance is not None or camera.kept for camera in calibration.cameras)
     known = ("known to\n+- mm", "known to\n+- degrees") if adjusted else ()
     measured = ("frames", "markers", "reprojection\nRMS px", "spread\nmm", "spread\ndegrees")
     for name in (*measured, *known, "x m", "y m", "z m"):
@@ -66,7 +72,7 @@ def _show_least_known(out: Console, calibration: Calibration) -> None:
     known = [
         (camera_sigma(camera.covariance, camera.T_world_cam).total_m, camera)
         for camera in calibration.cameras
-        if camera.covariance is not None
+        if camera.covariance is not None and camera.least_known
     ]
     if known:
         _, least = max(known, key=lambda pair: pair[0])
@@ -74,6 +80,8 @@ def _show_least_known(out: Console, calibration: Calibration) -> None:
 
 
 def _known_to(camera: CameraPose) -> tuple[str, ...]:
+    if camera.kept:
+        return "kept", "kept"
     if camera.covariance is None:
         return ()
     sigma = camera_sigma(camera.covariance, camera.T_world_cam)
@@ -103,6 +111,8 @@ def _show_verdict(out: Console, calibration: Calibration) -> None:
 
 
 def _world(calibration: Calibration) -> str:
+    if any(camera.kept for camera in calibration.cameras):
+        return "World: that of the cameras that were kept."
     if calibration.up is None:
         return "World: the target's frame; which way is up is not known (--auto-align turns it upright)."
     way = "up, against gravity" if calibration.up == "+y" else "down, along gravity (ZED Fusion's frame)"

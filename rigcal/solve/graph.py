@@ -32,6 +32,17 @@ class GraphHealth:
     weakest: WeakestLink | None  # of the best tree of the largest part; None for a single camera
 
     @property
+    def summary(self) -> str:
+        """One line: how many cameras hang together, and where the rig is weakest."""
+        groups = " | ".join(_listed(part) for part in self.parts)
+        if len(self.parts) > 1:
+            return f"cameras that see the target together: {groups}"
+        if self.weakest is None:
+            return f"one camera sees the target: {groups}"
+        link, n = self.weakest, sum(map(len, self.parts))
+        return f"{n} cameras hang together; weakest link: {link.i} and {link.j}, {link.frames} shared frames"
+
+    @property
     def suggestion(self) -> str:
         """What to record to make the rig stronger; empty where nothing is needed."""
         if len(self.parts) > 1:

@@ -5,12 +5,12 @@ Leaves    mathematics to problem and adjust, the judging of views to judge.
 
 A target that rests is one frame: its corners are averaged over time first, so that what repeats in every frame is not
 taken for knowledge. The world is the target's frame; for a moved target, that of the frame the averages chose, unless
-no view of that frame is left.
+no view of that frame is left. Cameras that must stay where they are carry the world instead, and the target is free.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,10 +47,17 @@ class JointRig:
     rejected: Mapping[str, tuple[int, ...]]  # placed camera -> frames whose view does not fit the others
     odd_markers: Mapping[int, float]  # marker -> its median corner over that of all corners, where that is large
     steps: int
+    fixed: frozenset[str] = frozenset()  # cameras that were not to be moved
 
 
 def adjust_rig(
-    rig: RigEstimate, cameras: Sequence[Camera], detections: Detections, geometry: Mapping[int, Array], *, moving: bool
+    rig: RigEstimate,
+    cameras: Sequence[Camera],
+    detections: Detections,
+    geometry: Mapping[int, Array],
+    *,
+    moving: bool,
+    fixed: Collection[str] = (),
 ) -> JointRig:
     """Adjust all placed cameras and all poses of the target together.
 
@@ -60,6 +67,7 @@ def adjust_rig(
         detections: What they saw; frames without a pose of the target in ``rig`` are left out.
         geometry: Marker id -> (k, 3) points [m], target frame.
         moving: Whether the target has a pose of its own in every frame.
+        fixed: Cameras that stay where ``rig`` puts them, to the bit.
 
     Returns:
         The cameras that views are left of, and why others are lost; of a moved target, the frames used.
@@ -74,7 +82,8 @@ def adjust_rig(
         np.array([rig.cameras[camera.name].T_world_cam for camera in placed]),
         np.array([rig.T_world_target[frame] for frame in sightings.frames]),
     )
-    gauge = Gauge(np.zeros(len(placed), dtype=bool), np.array([frame == rig.world_frame for frame in sightings.frames]))
+    held = np.array([camera.name in fixed for camera in placed], dtype=bool)
+    gauge = Gauge(held, np.array([frame == rig.world_frame and not held.any() for frame in sightings.frames]))
     judged = adjust_judging(sightings, start, gauge)
     beyond_promise, total_px = judged.adjustment.scale, 0.0
     for _ in range(NOISE_ROUNDS):
@@ -85,7 +94,8 @@ def adjust_rig(
         sightings = replace(sightings, sigma_px=np.hypot(sightings.sigma_px, more_px))
         judged = adjust_judging(sightings, start, gauge)
     result = _result(rig, sightings, judged, moving)
-    return replace(result, noise_px=total_px, beyond_promise=max(beyond_promise, result.scale))
+    beyond_promise = max(beyond_promise, result.scale)
+    return replace(result, noise_px=total_px, beyond_promise=beyond_promise, fixed=frozenset(fixed))
 
 
 def _resting(rig: RigEstimate, detections: Detections) -> dict[str, dict[int, Detection]]:
@@ -131,7 +141,7 @@ def _result(rig: RigEstimate, sightings: Sightings, judged: Judged, moving: bool
             rig,
             cameras=cameras,
             lost={**rig.lost, **lost},
-            T_world_target=targets if moving else rig.T_world_target,
+            T_world_target=targets if moving else dict.fromkeys(rig.T_world_target, targets[rig.world_frame]),
             world_frame=world_frame,
         ),
         covariance={name: carried(blocks[c, :, c], T_new_world) for c, name in enumerate(names) if name not in lost},
