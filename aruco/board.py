@@ -68,8 +68,11 @@ class CharucoBoard:
                 f"the marker of {self.marker_m:g} m does not fit into a square of {self.square_m:g} m; "
                 "give the square first, then the marker."
             )
-        if self.columns * self.rows < 6:
-            raise InputError("a board of 2x2 squares has one inner corner, too few for a pose; print a larger one.")
+        if min(self.columns, self.rows) < 3:
+            raise InputError(
+                f"a board of {self.columns}x{self.rows} squares has its inner corners in one row, too few for a pose; "
+                "print one of 3x3 squares or more."
+            )
         _check_ids(self.dictionary, 0, self.columns * self.rows // 2)
 
 

@@ -152,8 +152,8 @@ def judge(measured: Measured) -> Quality:
     readings = [*measured.readings, *_about_the_whole(measured)]
     checks, reasons = [], []
     worst: Verdict = "good"
-    # What makes it bad is told first.
-    for reading in sorted(readings, key=lambda r: not _is_bad(r)):
+    # A cause is told before its symptoms, then what makes it bad.
+    for reading in sorted(readings, key=lambda r: (r.gate != "residual pattern", not _is_bad(r))):
         gate = GATES[reading.gate]
         failed = gate.exceeded(reading.value, gate.good)
         if failed:

@@ -227,6 +227,7 @@ def _by_frame(sightings: Sightings, system: ViewSums) -> tuple[Array, Array]:
 
 
 def damped(H: Array, damping: float) -> Array:
+    """Blocks (k, 6, 6) with their diagonals raised by a share of themselves."""
     diagonal = np.einsum("kii->ki", H)
     return H + damping * np.maximum(diagonal, 1e-12)[:, :, None] * np.eye(6)
 

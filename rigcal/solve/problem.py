@@ -149,14 +149,26 @@ def view_sums(sightings: Sightings, poses: Poses, kappa: float, power: int = 1) 
         w = (1.0 + e / kappa**2) ** -power
         starts = sightings.start[views] - sightings.start[views.start]
         u, v = B[0] * w, B[1] * w
-        W[views] = np.add.reduceat(u[_ROW] * B[0][_COLUMN] + v[_ROW] * B[1][_COLUMN], starts, axis=1).T
-        g[views] = np.add.reduceat(u * r[0] + v * r[1], starts, axis=1).T
+        W[views] = _view_totals(u[_ROW] * B[0][_COLUMN] + v[_ROW] * B[1][_COLUMN], starts)
+        g[views] = _view_totals(u * r[0] + v * r[1], starts)
     square = np.empty((sightings.n_views, 6, 6))
     square[:, _ROW, _COLUMN] = W
     square[:, _COLUMN, _ROW] = W
-    Ad = np.array([adjoint(invert_transform(T)) for T in poses.T_world_cam]).reshape(-1, 6, 6)[sightings.view_camera]
-    Ad_T = Ad.transpose(0, 2, 1)
-    return ViewSums(Ad_T @ square @ Ad, (Ad_T @ g[:, :, None])[:, :, 0], squares)
+    for c, T in enumerate(poses.T_world_cam):
+        mine = slice(*np.searchsorted(sightings.view_camera, [c, c + 1]))
+        Ad = adjoint(invert_transform(T))
+        square[mine] = Ad.T @ square[mine] @ Ad
+        g[mine] = g[mine] @ Ad
+    return ViewSums(square, g, squares)
+
+
+def _view_totals(values: Array, starts: NDArray[np.int64]) -> Array:
+    """Sums (v, k) of values (k, n) over corners from each start to the next."""
+    size, uneven = divmod(values.shape[1], len(starts))
+    if uneven or (np.diff(starts) != size).any():
+        return np.add.reduceat(values, starts, axis=1).T
+    # Many short sums of one length, taken as one product, need a tenth of the time.
+    return (values.reshape(len(values), -1, size) @ np.ones(size)).T
 
 
 def residuals(sightings: Sightings, poses: Poses) -> Array:
