@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
+    from aruco.marker_geometry import Face
     from aruco.model import Calibration
     from rigcal.config import CalibrateConfig
 
@@ -58,6 +60,9 @@ DOUBTFUL = 3  # exit code: poses were written, but not of every camera, or they 
 @click.option("--fix", type=click.Path(path_type=Path), metavar="FILE",
               help="An extrinsics file: its cameras stay where they are, to the bit, and the others of the recording "
                    "are added in its world.")  # fmt: skip
+@click.option("--refine-target", is_flag=True,
+              help="The marker map is only roughly right: estimate where the markers are on the target too. Each keeps "
+                   "its size, which fixes the scale; the corrected map is written beside the output.")  # fmt: skip
 @click.option("--preview/--no-preview", default=False, show_default=True,
               help="Write annotated frames into a folder beside the output.")  # fmt: skip
 @click.option("--seed", type=int, default=0, show_default=True, help="For every random choice.")
@@ -78,6 +83,9 @@ def main(**given: Any) -> None:
         raise click.UsageError("give the target: --markers MAP.parquet, or --board SPEC, one of them")
     if given["fix"] and given["auto_align"]:
         raise click.UsageError("--fix keeps the world of its file, upright or not; leave out --auto-align")
+    if given["refine_target"] and (given["board"] or not given["joint"]):
+        raise click.UsageError("--refine-target estimates a marker map in the joint adjustment: it wants --markers, "
+                               "and neither --board nor --no-joint")  # fmt: skip
     if not given["auto_align"] and (given["ground_face"] or given["ground_marker_id"] or given["up_axis"] != "+y"):
         click.echo("warning: --ground-face, --ground-marker-id and --up-axis do nothing without --auto-align", err=True)
     from rigcal import cli
@@ -90,12 +98,18 @@ def main(**given: Any) -> None:
 
 def _run(given: dict[str, Any]) -> Calibration:
     from aruco.atomic import check_writable
+    from aruco.marker_geometry import save_faces
     from rigcal import cli
     from rigcal.formats import native
     from rigcal.pipeline import calibrate_files
 
     cli.refuse_inputs(given["output"], [*given["svo"], *given["inputs"]], given["markers"], given["fix"])
+    corrected_map = cli.beside(given["output"], "_markers.parquet")
     check_writable(given["output"])
+    if given["refine_target"]:
+        cli.refuse_inputs(corrected_map, [], given["markers"])
+        check_writable(corrected_map)
+    faces: list[Sequence[Face]] = []
     with cli.showing_progress() as progress:
         calibration = calibrate_files(
             [*given["svo"], *given["inputs"]],
@@ -105,8 +119,11 @@ def _run(given: dict[str, Any]) -> Calibration:
             fix=given["fix"],
             jobs=given["jobs"],
             progress=progress,
-            preview=cli.preview_folder(given["output"]) if given["preview"] else None,
+            preview=cli.beside(given["output"], "_preview") if given["preview"] else None,
+            on_target=faces.append,
         )
+    if faces:
+        save_faces(corrected_map, faces[0])
     native.write_extrinsics(given["output"], calibration)
     return calibration
 
@@ -130,6 +147,7 @@ def _config(given: dict[str, Any]) -> CalibrateConfig:
         moving_target=given["moving_target"],
         still=given["still"],
         joint=given["joint"],
+        refine_target=given["refine_target"],
         seed=given["seed"],
     )
 

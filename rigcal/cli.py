@@ -16,7 +16,7 @@ from aruco.model import Calibration
 from rigcal.report.progress import showing_progress
 from rigcal.report.terminal import console, show_calibration
 
-__all__ = ["preview_folder", "showing_progress", "tell", "telling_errors"]
+__all__ = ["beside", "showing_progress", "tell", "telling_errors"]
 
 
 @contextmanager
@@ -56,13 +56,17 @@ def refuse_inputs(output: Path, recordings: Sequence[Path], markers: Path | None
                 raise OutputError(f"{output}: lies in the camera folder {folder.name}, an input; choose another place.")
 
 
-def preview_folder(output: Path) -> Path:
-    """Where annotated frames go: beside the output, named after it."""
-    return output.with_name(f"{output.stem}_preview")
+def beside(output: Path, ending: str) -> Path:
+    """Where what goes with an output is written: beside it, named after it."""
+    return output.with_name(f"{output.stem}{ending}")
 
 
 def tell(calibration: Calibration, output: Path) -> None:
     """Print the table, and where the poses went."""
     out = console()
     show_calibration(out, calibration)
-    out.print(f"Wrote {len(calibration.cameras)} camera poses to {output}", markup=False)
+    if "target_refined" in calibration.notes:
+        out.print(f"Wrote the corrected marker map to {beside(output, '_markers.parquet')}", markup=False)
+    apart = sum(len(part.cameras) for part in calibration.parts)
+    more = f", and of {apart} in worlds of their own" if apart else ""
+    out.print(f"Wrote {len(calibration.cameras)} camera poses{more} to {output}", markup=False)

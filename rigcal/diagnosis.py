@@ -6,7 +6,7 @@ Owns      the sentences, and the looking that they need.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 
@@ -22,6 +22,8 @@ from aruco.rig_estimate import Placement, RigEstimate
 from aruco.svo_sync import SyncResult
 from rigcal.config import DetectConfig
 from rigcal.detecting import Seen
+from rigcal.evidence import Evidence
+from rigcal.intrinsics_check import other_resolution
 from rigcal.target import Target
 
 # Enough to see a marker if there is one, few enough to try two dozen dictionaries on.
@@ -168,34 +170,58 @@ def cameras_without_views(recording: Recording, sync: SyncResult, seen: Mapping[
     return reasons
 
 
-def refuse_misfits(rig: RigEstimate, residuals: Mapping[str, Reprojection], cameras: Sequence[Camera]) -> RigEstimate:
+def refuse_misfits(rig: RigEstimate, residuals: Mapping[str, Reprojection], evidence: Evidence) -> RigEstimate:
     """The rig without cameras whose corners lie so far from where they should that the pose means nothing.
+
+    Returns:
+        The rest; lost cameras are told their intrinsics are of another resolution where the views say so.
 
     Raises:
         CalibrationError: None is left.
     """
-    width = {camera.name: camera.width for camera in cameras}
+    models = {camera.name: camera for camera in evidence.cameras}
     refused = {
         name: (
             f"the corners lie {r.rms_px:.0f} px (RMS) from where the marker map puts them, farthest those of "
             f"{_worst(r)}: check that map (ids, corner order, sizes) and intrinsics are this target's and camera's"
         )
         for name, r in residuals.items()
-        if not r.rms_px <= max(MISFIT_PX, MISFIT_SHARE * width[name])
+        if not r.rms_px <= max(MISFIT_PX, MISFIT_SHARE * models[name].width)
     }
+    lost = {name: intrinsics_fault(models[name], evidence) or why for name, why in {**rig.lost, **refused}.items()}
     if len(refused) == len(rig.cameras):
-        name, reason = next(iter(refused.items()))
-        raise CalibrationError(f"No camera fits: camera {name}: {reason}.")
+        name = next(iter(refused))
+        raise CalibrationError(f"No camera fits: camera {name}: {lost[name]}.")
     kept = {name: placement for name, placement in rig.cameras.items() if name not in refused}
-    return replace(rig, cameras=kept, lost={**rig.lost, **refused})
+    return replace(rig, cameras=kept, lost=lost)
+
+
+def is_doubtful(residuals: Reprojection) -> bool:
+    """Whether a camera's corners are off by more than good intrinsics and a true map leave."""
+    return residuals.rms_px > DOUBTFUL_RMS_PX
+
+
+def intrinsics_fault(camera: Camera, evidence: Evidence) -> str:
+    """What a camera's own views say about its intrinsics; empty where they see no fault."""
+    return other_resolution(camera, evidence.seen[camera.name].detections, evidence.target.geometry)
 
 
 def _worst(residuals: Reprojection) -> str:
     return ", ".join(str(marker) for marker in residuals.worst_markers(3))
 
 
-def warnings(placement: Placement, residuals: Reprojection, seen: Seen, up: Array | None) -> Iterator[str]:
-    """What a user should know about one camera of the result; ``up`` (3,) in its world, None where it is unknown."""
+def warnings(
+    placement: Placement, residuals: Reprojection, seen: Seen, up: Array | None, intrinsics: str = ""
+) -> Iterator[str]:
+    """What a user should know about one camera of the result.
+
+    Args:
+        placement: Where it stands.
+        residuals: Of its corners.
+        seen: What it saw.
+        up: (3,) in its world; None where that is unknown.
+        intrinsics: What is wrong with them, as far as views show it.
+    """
     reach = float(np.median([np.linalg.norm(view.best.T_cam_target[:3, 3]) for view in seen.views]))
     if reach > FAR_M:
         yield f"stands {reach:.0f} m from the target: are the sizes in the marker map metres?"
@@ -212,5 +238,6 @@ def warnings(placement: Placement, residuals: Reprojection, seen: Seen, up: Arra
         yield f"{left_out} of {placement.n_views} views do not fit the others"
     if len(placement.frames) == 1:
         yield "a single view: its spread is unknown"
-    if residuals.rms_px > DOUBTFUL_RMS_PX:
-        yield f"reprojection {residuals.rms_px:.1f} px: check the intrinsics and the marker map"
+    if is_doubtful(residuals):
+        why = intrinsics or "check the intrinsics and the marker map"
+        yield f"reprojection {residuals.rms_px:.1f} px: {why}"

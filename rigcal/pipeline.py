@@ -6,7 +6,7 @@ Leaves    every step to the tools in aruco and the rooms of rigcal.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from loguru import logger
 
 from aruco import alignment, moved_target, resting_target
 from aruco.errors import CalibrationError
-from aruco.marker_geometry import Face
+from aruco.marker_geometry import Face, corrected_faces
 from aruco.model import SILENT, Calibration, CameraPose, Progress, Recording
 from aruco.moved_alignment import find_up_moved
 from aruco.pose_math import Pose, make_pose
@@ -32,12 +32,15 @@ from rigcal.preview_writer import PreviewWriter
 from rigcal.quality.gates import Quality
 from rigcal.solve.graph import GraphHealth, graph_health
 from rigcal.solve.joint import JointRig, adjust_rig
+from rigcal.solve.joint_target import refine_rig_target
 from rigcal.sources import open_recordings
 from rigcal.target import Target, board_target, marker_target_from_file
 from rigcal.validation import validate
 from rigcal.verdict import depth_below_target, quality_of
 
 NOTHING_KEPT = KeptRig(T_world_cam={})
+# Called with the faces of a target whose map was corrected.
+OnTarget = Callable[[Sequence[Face]], object]
 
 
 def calibrate(
@@ -49,6 +52,7 @@ def calibrate(
     resources: Resources | None = None,
     progress: Progress = SILENT,
     on_frame: OnFrame | None = None,
+    on_target: OnTarget = lambda faces: None,
 ) -> Calibration:
     """Every camera's pose in the target's world.
 
@@ -60,6 +64,7 @@ def calibrate(
         resources: What changes only time and memory.
         progress: Is told how far the long steps have come.
         on_frame: Is called with every image that was read, from several threads.
+        on_target: Is called with the target's corrected faces, if they were estimated.
 
     Raises:
         InputError: The recording or an option cannot be used.
@@ -71,11 +76,17 @@ def calibrate(
     if config.still:
         evidence = at_rest(evidence)
     health = _connections(evidence)
+    refined: dict[str, Any] = {}
     first, *others = place_cameras(evidence, kept)
+    if config.refine_target:
+        evidence, refined = correct_target(first, evidence, kept)
+        on_target(evidence.target.faces)
+        first, *others = place_cameras(evidence, kept)
     calibration = finish(first, evidence, kept)
     about = {
         "frames": notes.frame_counts(evidence.seen),
         "sync": notes.clock(evidence.moments),
+        **refined,
         **({} if health is None else {"connections": health.as_dict()}),
         "provenance": notes.provenance(evidence, kept),
     }
@@ -98,6 +109,7 @@ def calibrate_files(
     jobs: int | None = None,
     progress: Progress = SILENT,
     preview: Path | None = None,
+    on_target: OnTarget = lambda faces: None,
 ) -> Calibration:
     """The same, from files: recordings, a marker map or a board, and a folder for previews if they are wished."""
     if board is None:
@@ -111,7 +123,16 @@ def calibrate_files(
     recording = open_recordings(paths)
     on_frame = None if preview is None else PreviewWriter(preview, target.geometry)
     resources = Resources() if jobs is None else Resources(jobs=jobs)
-    return calibrate(recording, target, config, kept=kept, resources=resources, progress=progress, on_frame=on_frame)
+    return calibrate(
+        recording,
+        target,
+        config,
+        kept=kept,
+        resources=resources,
+        progress=progress,
+        on_frame=on_frame,
+        on_target=on_target,
+    )
 
 
 def _connections(evidence: Evidence) -> GraphHealth | None:
@@ -145,6 +166,18 @@ def place_cameras(evidence: Evidence, kept: KeptRig) -> list[RigEstimate]:
     return rigs
 
 
+def correct_target(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> tuple[Evidence, dict[str, Any]]:
+    """The same evidence on a corrected map of the target, and what to note about it."""
+    target, seen = evidence.target, evidence.detections
+    moving, fixed = evidence.config.target_moves, kept.T_world_cam.keys()
+    found = refine_rig_target(average, evidence.cameras, seen, target.geometry, moving=moving, fixed=fixed)
+    corrected = replace(target, geometry=found.geometry, faces=corrected_faces(target.faces, found.geometry))
+    note = notes.corrected_target(found, target.geometry)
+    for sentence in note["warnings"]:
+        logger.warning(sentence)
+    return evidence.with_target(corrected), {"target_refined": note}
+
+
 def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> Calibration:
     """One connected part of the rig: adjusted, checked, turned upright if that is wished.
 
@@ -156,21 +189,30 @@ def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> Calibrati
     joint = None
     if config.joint:
         seen = evidence.detections
-        joint = adjust_rig(average, evidence.cameras, seen, target.geometry, moving=moving, fixed=fixed)
+        joint = adjust_rig(
+            average,
+            evidence.cameras,
+            seen,
+            target.geometry,
+            moving=moving,
+            fixed=fixed,
+            shape_unknown=config.refine_target,
+        )
     rig = average if joint is None else joint.rig
     used = {name: {f: evidence.seen[name].detections[f] for f in p.frames} for name, p in rig.cameras.items()}
     residuals = reproject({camera.name: camera for camera in evidence.cameras}, rig, used, target.geometry)
-    rig = diagnosis.refuse_misfits(rig, residuals, evidence.cameras)
+    rig = diagnosis.refuse_misfits(rig, residuals, evidence)
     T_aligned_world, about = align(rig, target.faces, config.align, moving=moving)
     rig = rig.turned(T_aligned_world[:3, :3])
     if joint is not None:
         about["adjusted"] = notes.adjustment(joint)
-        about["quality"] = assess(average, joint, rig, evidence).as_dict()
+        told = replace(joint, rig=replace(joint.rig, lost=rig.lost))
+        about["quality"] = assess(average, told, rig, evidence).as_dict()
     unmoved = kept if fixed & rig.cameras.keys() else NOTHING_KEPT
     for name in fixed & rig.lost.keys():
         logger.warning("camera {} keeps its pose, but took no part: {}", name, rig.lost[name])
     return Calibration(
-        cameras=_camera_poses(rig, evidence.seen, residuals, joint, T_aligned_world, config.align, unmoved),
+        cameras=_camera_poses(rig, evidence, residuals, joint, T_aligned_world, unmoved),
         lost={name: reason for name, reason in rig.lost.items() if name not in unmoved.T_world_cam},
         up=config.align.up_axis if config.align.enabled else unmoved.up,
         origin=str(unmoved.world.get("origin", "target")),
@@ -221,16 +263,18 @@ def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, movin
 
 def _camera_poses(
     rig: RigEstimate,
-    seen: Mapping[str, Seen],
+    evidence: Evidence,
     residuals: Mapping[str, Reprojection],
     joint: JointRig | None,
     T_aligned_world: Pose,
-    config: AlignConfig,
     kept: KeptRig,
 ) -> tuple[CameraPose, ...]:
     """The finished cameras, in order of their names."""
+    seen, config = evidence.seen, evidence.config.align
     up = np.array([0.0, 1.0 if config.up_axis == "+y" else -1.0, 0.0]) if config.enabled else None
     unmoved = kept.T_world_cam
+    doubtful = [c for c in evidence.cameras if c.name in rig.cameras and diagnosis.is_doubtful(residuals[c.name])]
+    faults = {camera.name: diagnosis.intrinsics_fault(camera, evidence) for camera in doubtful}
     known = {} if joint is None else {n: S for n, S in joint.covariance.items() if n not in unmoved}
     return tuple(
         CameraPose(
@@ -244,7 +288,7 @@ def _camera_poses(
             covariance=carried(known[name], T_aligned_world) if name in known else kept.covariance.get(name),
             least_known=_least_known(name, rig, known[name], T_aligned_world, seen[name]) if name in known else "",
             kept=name in unmoved,
-            warnings=tuple(diagnosis.warnings(placement, residuals[name], seen[name], up)),
+            warnings=tuple(diagnosis.warnings(placement, residuals[name], seen[name], up, faults.get(name, ""))),
         )
         for name, placement in sorted(rig.cameras.items())
     )

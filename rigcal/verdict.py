@@ -15,6 +15,7 @@ from aruco.pose_math import Array, Pose, transform_points
 from aruco.rig_estimate import RigEstimate
 from aruco.uncertainty import camera_sigma, least_known
 from rigcal.quality.gates import Measured, Quality, Reading, judge
+from rigcal.solve.repetition import places
 from rigcal.validation import Split, Validation
 
 # Fewer lengths than the sides of two markers are no measurement.
@@ -26,6 +27,7 @@ SCALE_REMARK = (
     "one printed marker."
 )
 CHECK_INPUT = "check that the marker map and every camera_info.yaml belong to this recording"
+ROUGH_MAP = "; --refine-target corrects a map that is only roughly measured"
 MORE = {
     True: "record more frames, with the target nearer to the cameras, in more places and turned more ways",
     False: "put the target nearer to the cameras, record more frames, or move it between them (--moving-target)",
@@ -123,7 +125,7 @@ def _residuals(v: Validation) -> Iterator[Reading]:
     advice = f"The corners of camera {name} lie {px:.1f} px from where the poses put them: {CHECK_INPUT}."
     yield Reading(gate="reprojection", value=px, sentence=advice)
     scale = v.adjusted.beyond_promise
-    advice = f"Corners are off {scale:.0f} times as much as their edges promise: {CHECK_INPUT}."
+    advice = f"Corners are off {scale:.0f} times as much as their edges promise: {CHECK_INPUT}{ROUGH_MAP}."
     yield Reading(gate="residual scale", value=scale, sentence=advice)
     if v.patterns.focal_noticed:
         name, least = _worst(v.patterns.focal_noticed)
@@ -136,7 +138,8 @@ def _residuals(v: Validation) -> Iterator[Reading]:
     odd = v.adjusted.odd_markers
     listed = ", ".join(f"{marker} ({ratio:.0f} times)" for marker, ratio in sorted(odd.items()))
     advice = (
-        f"Markers that lie farther off than all others: {listed}; they are loose, bent, or wrong in the marker map."
+        f"Markers that lie farther off than all others: {listed}; they are loose, bent, or wrong in the marker "
+        f"map{ROUGH_MAP}."
     )
     yield Reading(gate="odd markers", value=float(len(odd)), sentence=advice)
 
@@ -211,6 +214,13 @@ def _views(v: Validation) -> Iterator[Reading]:
         f"Camera {name} has {alone}, so its errors cannot be seen: record more frames in which it sees the target."
     )
     yield Reading(gate=gate, value=float(n_used[name]), sentence=sentence)
+    if v.moving:
+        n_places = _n_places(v)
+        sentence = (
+            f"The target was in only {n_places} place{'s' * (n_places > 1)}: frames that repeat a place repeat its "
+            "errors, whatever their number; move it around and turn it."
+        )
+        yield Reading(gate="places of the target", value=float(n_places), sentence=sentence)
     if v.weakest is not None:
         link = v.weakest
         sentence = (
@@ -218,6 +228,11 @@ def _views(v: Validation) -> Iterator[Reading]:
             "both see it and record more."
         )
         yield Reading(gate="frames of the weakest link", value=float(link.n_shared), sentence=sentence)
+
+
+def _n_places(v: Validation) -> int:
+    targets = v.adjusted.rig.T_world_target
+    return int(places(np.array([targets[frame] for frame in sorted(targets)])).max(initial=-1)) + 1
 
 
 def _kept(v: Validation) -> Iterator[Reading]:

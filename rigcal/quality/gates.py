@@ -111,6 +111,8 @@ GATES: dict[str, Gate] = {
         # One view hides its own errors. Five of a moved target leave three times more residuals than unknowns.
         Gate("views of a camera", "", 5.0, 1.0, at_least=True),
         Gate("views of a camera, target at rest", "", 2.0, 1.0, at_least=True),
+        # The same for places, which frames only repeat.
+        Gate("places of the target", "", 5.0, 1.0, at_least=True),
         Gate("frames of the weakest link", "", 5.0, 1.0, at_least=True),
         Gate("cameras placed", "percent", 100.0, 50.0, at_least=True),
         Gate("cameras checked independently", "percent", 100.0, 0.0, at_least=True),

@@ -31,6 +31,7 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
             out.print(f"warning: camera {camera.camera}: {warning}", markup=False)
     for name, reason in calibration.lost.items():
         out.print(f"no pose: camera {name}: {reason}", markup=False)
+    _show_target(out, calibration)
     for name in calibration.unused:
         out.print(f"kept: camera {name}: as its file says, not seen by this recording", markup=False)
     _show_clock(out, calibration)
@@ -86,6 +87,19 @@ def _known_to(camera: CameraPose) -> tuple[str, ...]:
         return ()
     sigma = camera_sigma(camera.covariance, camera.T_world_cam)
     return f"{1e3 * sigma.total_m:.2f}", f"{math.degrees(sigma.total_rad):.3f}"
+
+
+def _show_target(out: Console, calibration: Calibration) -> None:
+    found = calibration.notes.get("target_refined")
+    if not found or not found["moved_mm"]:
+        return
+    moved, sigma = found["moved_mm"], found["sigma_mm"]
+    worst = max(moved, key=lambda marker: moved[marker])
+    out.print(
+        f"Marker map: {len(moved)} markers moved, by up to {moved[worst]:.2f} mm (marker {worst}), now known to "
+        f"+- {max(sigma.values()):.2f} mm or better",
+        markup=False,
+    )
 
 
 def _show_clock(out: Console, calibration: Calibration) -> None:

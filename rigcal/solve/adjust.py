@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from aruco.merged_detection import RAYLEIGH_MEDIAN
 from aruco.pose_math import Array, Pose, exp_so3
 from rigcal.solve.problem import Poses, Sightings, ViewSums, residuals, view_sums
-from rigcal.solve.repetition import repetition
+from rigcal.solve.repetition import places, repetition
 
 # 95 % efficient for clean Gaussian corners (Holland and Welsch 1977: 2.385), deaf to gross errors.
 KAPPA = 2.385
@@ -270,7 +270,7 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
     variance = residual_variance(system.squares, degrees_of_freedom(sightings, gauge), kappa)
     W, _ = _by_frame(sightings, system)
     _, g = _by_frame(sightings, view_sums(sightings, poses, kappa))
-    return variance * repetition(W, g, E, Y, P, variance) * P
+    return variance * repetition(W, g, E, Y, P, variance, places(poses.T_world_target)) * P
 
 
 def residual_variance(squares: Array, dof: int, kappa: float) -> float:

@@ -26,6 +26,7 @@ from rigcal.solve.adjust import Gauge
 from rigcal.solve.judge import MAX_VIEW_MEDIAN, Judged, adjust_judging, confirmed
 from rigcal.solve.model_noise import model_noise_px
 from rigcal.solve.problem import Poses, Sightings, gather, residuals
+from rigcal.solve.target_shape import refine_target
 
 # camera -> frame -> markers
 Detections = Mapping[str, Mapping[int, Detection]]
@@ -58,6 +59,7 @@ def adjust_rig(
     *,
     moving: bool,
     fixed: Collection[str] = (),
+    shape_unknown: bool = False,
 ) -> JointRig:
     """Adjust all placed cameras and all poses of the target together.
 
@@ -68,6 +70,7 @@ def adjust_rig(
         geometry: Marker id -> (k, 3) points [m], target frame.
         moving: Whether the target has a pose of its own in every frame.
         fixed: Cameras that stay where ``rig`` puts them, to the bit.
+        shape_unknown: Whether the geometry was estimated from the same views: the covariance then contains that.
 
     Returns:
         The cameras that views are left of, and why others are lost; of a moved target, the frames used.
@@ -75,15 +78,7 @@ def adjust_rig(
     Raises:
         CalibrationError: The views contradict each other so much that no two cameras are left.
     """
-    placed = [camera for camera in cameras if camera.name in rig.cameras]
-    used = _moved(rig, detections) if moving else _resting(rig, detections)
-    sightings = gather(placed, used, geometry)
-    start = Poses(
-        np.array([rig.cameras[camera.name].T_world_cam for camera in placed]),
-        np.array([rig.T_world_target[frame] for frame in sightings.frames]),
-    )
-    held = np.array([camera.name in fixed for camera in placed], dtype=bool)
-    gauge = Gauge(held, np.array([frame == rig.world_frame and not held.any() for frame in sightings.frames]))
+    sightings, start, gauge = prepared(rig, cameras, detections, geometry, moving=moving, fixed=fixed)
     judged = adjust_judging(sightings, start, gauge)
     beyond_promise, total_px = judged.adjustment.scale, 0.0
     for _ in range(NOISE_ROUNDS):
@@ -93,9 +88,34 @@ def adjust_rig(
         total_px = float(np.hypot(total_px, more_px))
         sightings = replace(sightings, sigma_px=np.hypot(sightings.sigma_px, more_px))
         judged = adjust_judging(sightings, start, gauge)
+    if shape_unknown and judged.kept.any():
+        shape = refine_target(sightings.only_views(judged.kept), judged.adjustment.poses, judged.gauge, geometry)
+        judged = replace(judged, adjustment=replace(judged.adjustment, covariance=shape.covariance))
     result = _result(rig, sightings, judged, moving)
     beyond_promise = max(beyond_promise, result.scale)
     return replace(result, noise_px=total_px, beyond_promise=beyond_promise, fixed=frozenset(fixed))
+
+
+def prepared(
+    rig: RigEstimate,
+    cameras: Sequence[Camera],
+    detections: Detections,
+    geometry: Mapping[int, Array],
+    *,
+    moving: bool,
+    fixed: Collection[str] = (),
+) -> tuple[Sightings, Poses, Gauge]:
+    """What is adjusted, from where on, and what carries the world; see adjust_rig for the arguments."""
+    placed = [camera for camera in cameras if camera.name in rig.cameras]
+    used = _moved(rig, detections) if moving else _resting(rig, detections)
+    sightings = gather(placed, used, geometry)
+    start = Poses(
+        np.array([rig.cameras[camera.name].T_world_cam for camera in placed]),
+        np.array([rig.T_world_target[frame] for frame in sightings.frames]),
+    )
+    held = np.array([camera.name in fixed for camera in placed], dtype=bool)
+    gauge = Gauge(held, np.array([frame == rig.world_frame and not held.any() for frame in sightings.frames]))
+    return sightings, start, gauge
 
 
 def _resting(rig: RigEstimate, detections: Detections) -> dict[str, dict[int, Detection]]:

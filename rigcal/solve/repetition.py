@@ -1,28 +1,48 @@
-"""How much corners of one frame repeat each other: the factor by which independent residuals promise too little.
+"""How much corners repeat each other: the factor by which independent residuals promise too little.
 
-Owns      the comparison of every frame's pull on the cameras with what independent corners would pull.
+Owns      the places a target was in, and the comparison of each place's pull on the cameras with what independent
+          corners would pull.
 
-A frame taken a little late, or a lens that differs from its model, moves all corners of a view together. Each frame's
-gradient s_f with respect to the cameras, its target eliminated, then has a larger spread than the normal equations
-promise: ``sum s_f^T P s_f`` is on average ``variance (p - sum tr (S_f P)^2)`` for independent residuals, where S_f is
-what frame f adds to the cameras' system S, P = S^-1, and p the number of unknowns. That is the trace of the sandwich
-covariance clustered by frames (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986),
-with the leverage of each frame taken out exactly.
+A frame taken a little late, or a lens that differs from its model, moves all corners of a view together, and frames of
+a target that rests repeat each other's errors. Each place's gradient s_k with respect to the cameras, its targets
+eliminated, then has a larger spread than the normal equations promise: ``sum s_k^T P s_k`` is on average
+``variance (p - sum tr (S_k P)^2)`` for independent residuals, where S_k is what place k adds to the cameras' system S,
+P = S^-1, and p the number of unknowns. That is the trace of the sandwich covariance clustered by places (Liang and
+Zeger, "Longitudinal data analysis using generalized linear models", 1986), with each cluster's leverage taken out
+exactly.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from aruco.pose_math import Array
+from aruco.pose_math import Array, Pose, pose_distance
 
-# Each frame's leverage costs a product of two matrices over all cameras: so many frames, evenly spread, stand for all.
-MAX_FRAMES = 100
-# A frame that alone decides where a camera is has nothing to disagree with: three frames that count alike reach 2/3.
+# Each place's leverage costs a product of two matrices over all cameras: so many, evenly spread, stand for all.
+MAX_PLACES = 100
+# A place that alone decides where a camera is has nothing to disagree with: three that count alike reach 2/3.
 MIN_INDEPENDENT = 0.6
 
 
-def repetition(W: Array, g: Array, E: Array, Y: Array, P: Array, variance: float) -> float:
+# A target that has moved less than this is where it was: its corners lie at the same places of pixels and lens.
+SAME_PLACE_M = 5e-3
+SAME_PLACE_RAD = 0.01
+
+
+def places(T_world_target: Pose) -> NDArray[np.int64]:
+    """The place (f,) of every frame, given in time order: a new one whenever the target has moved (f, 4, 4)."""
+    label = np.zeros(len(T_world_target), dtype=np.int64)
+    first = 0
+    for f in range(1, len(T_world_target)):
+        turn_rad, shift_m = pose_distance(T_world_target[first], T_world_target[f])
+        moved = turn_rad > SAME_PLACE_RAD or shift_m > SAME_PLACE_M
+        first = f if moved else first
+        label[f] = label[f - 1] + moved
+    return label
+
+
+def repetition(W: Array, g: Array, E: Array, Y: Array, P: Array, variance: float, place: NDArray[np.int64]) -> float:
     """The factor on the covariance, at least one.
 
     Args:
@@ -32,12 +52,15 @@ def repetition(W: Array, g: Array, E: Array, Y: Array, P: Array, variance: float
         Y: (f, 6c, 6) E times the inverses of the targets' blocks.
         P: (6c, 6c) inverse of the cameras' system, zero for fixed ones.
         variance: Of a residual coordinate.
+        place: (f,) frames with equal numbers may repeat each other.
     """
-    n_frame = len(W)
-    scores = -g.reshape(n_frame, -1)
-    pull = float(np.einsum("fi,fi->", scores @ P, scores))
-    step = -(-n_frame // MAX_FRAMES) if n_frame else 1
-    leverage = sum(_squared_leverage(W[f], E[f], Y[f], P) for f in range(0, n_frame, step)) * step
+    n_place = int(place.max(initial=-1)) + 1
+    scores = np.zeros((n_place, P.shape[0]))
+    np.add.at(scores, place, -g.reshape(len(g), -1))
+    pull = float(np.einsum("ki,ki->", scores @ P, scores))
+    step = max(1, -(-n_place // MAX_PLACES))
+    some = (np.flatnonzero(place == k) for k in range(0, n_place, step))
+    leverage = sum(_squared_leverage(W[f], E[f], Y[f], P) for f in some) * step
     n_free = 6 * np.count_nonzero(P.any(axis=1).reshape(-1, 6).any(axis=1))
     if n_free - leverage <= MIN_INDEPENDENT * n_free:
         return 1.0
@@ -45,9 +68,9 @@ def repetition(W: Array, g: Array, E: Array, Y: Array, P: Array, variance: float
 
 
 def _squared_leverage(W: Array, E: Array, Y: Array, P: Array) -> float:
-    """Trace of (S_f P)^2 for one frame."""
-    S = -Y @ E.T
-    for k, block in enumerate(W):
+    """Trace of (S_k P)^2 for the frames of one place."""
+    S = -np.tensordot(Y, E, axes=([0, 2], [0, 2]))
+    for k, block in enumerate(W.sum(axis=0)):
         S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += block
     L = S @ P
     return float(np.einsum("ij,ji->", L, L))

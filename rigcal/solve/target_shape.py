@@ -33,7 +33,7 @@ from aruco.pose_math import Array, Pose, adjoint, invert_transform, make_pose, s
 from rigcal.solve import adjust as solver
 from rigcal.solve.adjust import Gauge, optimise
 from rigcal.solve.problem import Poses, Sightings, ViewSums, view_sums
-from rigcal.solve.repetition import repetition
+from rigcal.solve.repetition import places, repetition
 
 # A marker whose place or direction relative to the others the views leave open by more than this is better known from
 # a map that is right to some millimetres and degrees.
@@ -287,10 +287,10 @@ class ShapeProblem:
         basis = self.basis(unknowns)
         covariance = basis @ np.linalg.inv(basis.T @ S @ basis) @ basis.T
         variance = solver.residual_variance(sums.squares, self.dof, kappa)
-        variance *= self._repetition(normal, S, Y, self.sums(unknowns, kappa).g, variance)
+        variance *= self._repetition(unknowns, normal, S, Y, self.sums(unknowns, kappa).g, variance)
         return variance * (covariance + covariance.T) / 2
 
-    def _repetition(self, normal: _Normal, S: Array, Y: Array, g: Array, variance: float) -> float:
+    def _repetition(self, unknowns: Shape, normal: _Normal, S: Array, Y: Array, g: Array, variance: float) -> float:
         """How much corners of one frame repeat each other in what they say about the cameras."""
         rows, n_cam, n_frame = self.rows, len(self.rows.cameras), len(self.rows.frames)
         cameras = slice(0, 6 * n_cam)
@@ -299,9 +299,8 @@ class ShapeProblem:
         P = np.zeros((6 * n_cam, 6 * n_cam))
         P[np.ix_(free, free)] = np.linalg.inv(S[cameras, cameras][np.ix_(free, free)])
         g_frame_cam = _summed(g, rows.view_frame * n_cam + rows.view_camera, n_frame * n_cam)
-        return repetition(
-            -E.reshape(n_frame, n_cam, 6, 6), g_frame_cam.reshape(n_frame, n_cam, 6), E, Y[:, cameras], P, variance
-        )
+        W, g = -E.reshape(n_frame, n_cam, 6, 6), g_frame_cam.reshape(n_frame, n_cam, 6)
+        return repetition(W, g, E, Y[:, cameras], P, variance, places(unknowns.poses.T_world_target))
 
     def parts(self, poses: Poses) -> NDArray[np.int64]:
         """Which part of the target every marker (m,) belongs to; -1 for points and for markers that are tied to none.
