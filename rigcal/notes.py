@@ -49,8 +49,10 @@ def clock(moments: Moments) -> dict[str, Any]:
 def adjustment(joint: JointRig) -> dict[str, Any]:
     """What the joint adjustment found out about its input."""
     return {
-        "residual_scale": joint.beyond_promise,
-        "model_noise_px": joint.noise_px,
+        "residual_scale": joint.corners.beyond_promise,
+        "model_noise_px": joint.corners.noise_px,
+        "edge_shift_px": dict(joint.corners.shift_px),
+        "doubtful_edge_shift_px": dict(joint.corners.doubtful_shift_px),
         "rejected_views": {name: list(frames) for name, frames in joint.rejected.items()},
         "odd_markers": {str(marker): ratio for marker, ratio in joint.odd_markers.items()},
     }

@@ -188,18 +188,18 @@ def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> Calibrati
     moving, fixed = config.target_moves, kept.T_world_cam.keys()
     joint = None
     if config.joint:
-        seen = evidence.detections
         joint = adjust_rig(
             average,
             evidence.cameras,
-            seen,
+            evidence.detections,
             target.geometry,
             moving=moving,
             fixed=fixed,
             shape_unknown=config.refine_target,
         )
     rig = average if joint is None else joint.rig
-    used = {name: {f: evidence.seen[name].detections[f] for f in p.frames} for name, p in rig.cameras.items()}
+    seen = evidence.detections if joint is None else joint.corners.taken_out_of(evidence.detections)
+    used = {name: {f: seen[name][f] for f in p.frames} for name, p in rig.cameras.items()}
     residuals = reproject({camera.name: camera for camera in evidence.cameras}, rig, used, target.geometry)
     rig = diagnosis.refuse_misfits(rig, residuals, evidence)
     T_aligned_world, about = align(rig, target.faces, config.align, moving=moving)

@@ -26,7 +26,6 @@ from rigcal.quality.lengths import Lengths, measure_lengths
 from rigcal.quality.patterns import Corners, Tested, search_patterns
 from rigcal.solve.adjust import Adjustment, adjust
 from rigcal.solve.joint import Detections, JointRig
-from rigcal.solve.model_noise import noisier
 from rigcal.solve.problem import Poses, Sightings, gather, residuals, view_sums
 from rigcal.validation_case import Case, Frames, case_of, merged_views, solve_part, view_mask
 
@@ -104,7 +103,7 @@ def validate(
         moving: Whether the target has a pose of its own in every frame.
         share: Of the frames, to be held out; fewer where a camera or a link would not be left enough.
     """
-    detections = noisier(detections, adjusted.noise_px)
+    detections = adjusted.corners.taken_out_of(detections)
     case = case_of(rig_average, adjusted, cameras, detections, geometry, moving)
     held = _held_frames(case, share)
     rest = {name: tuple(f for f in frames if f not in set(held[name])) for name, frames in case.used.items()}

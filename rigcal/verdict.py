@@ -124,7 +124,7 @@ def _residuals(v: Validation) -> Iterator[Reading]:
     name, px = _worst(v.reprojection_px)
     advice = f"The corners of camera {name} lie {px:.1f} px from where the poses put them: {CHECK_INPUT}."
     yield Reading(gate="reprojection", value=px, sentence=advice)
-    scale = v.adjusted.beyond_promise
+    scale = v.adjusted.corners.beyond_promise
     advice = f"Corners are off {scale:.0f} times as much as their edges promise: {CHECK_INPUT}{ROUGH_MAP}."
     yield Reading(gate="residual scale", value=scale, sentence=advice)
     if v.patterns.focal_noticed:

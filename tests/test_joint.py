@@ -264,7 +264,7 @@ def test_two_cameras_that_contradict_each_other_everywhere_are_never_silent(seed
     except CalibrationError:
         return
     # Where all is wrong nothing stands out: but then all residuals are pixels, a hundred times what sigmas promise.
-    assert joint.beyond_promise > 10
+    assert joint.corners.beyond_promise > 10
 
 
 def test_a_single_camera_of_a_moved_target_is_adjusted_to_its_frame() -> None:

@@ -12,10 +12,10 @@ from scipy.stats import chi2
 from aruco.model import Detection
 from aruco.pose_math import Array, adjoint, invert_transform, log_se3
 from rigcal.solve import adjust as solver
-from rigcal.solve import joint as joint_module
+from rigcal.solve import corner_errors
 from rigcal.solve.adjust import adjust
+from rigcal.solve.corner_errors import CornerErrors
 from rigcal.solve.joint import JointRig, adjust_rig
-from rigcal.solve.model_noise import noisier
 
 
 def disturbed(rig: SimRig, noise_px: float, rng: np.random.Generator) -> SimRig:
@@ -48,20 +48,20 @@ def test_model_noise_is_found(noise_px: float) -> None:
     rng = np.random.default_rng(1)
     joint = adjusted(disturbed(board_rig(rng, sigma_px=0.03), noise_px, rng), rng)
     # A robust deviation from about 8000 coordinates is good to 2 %; the corners' own sigmas blur it a little.
-    assert joint.noise_px == pytest.approx(noise_px, rel=0.06)
+    assert joint.corners.noise_px == pytest.approx(noise_px, rel=0.06)
     assert joint.scale == pytest.approx(1.0, abs=0.06)
-    assert joint.beyond_promise > 4
+    assert joint.corners.beyond_promise > 4
 
 
 def test_there_is_none_where_sigmas_are_right() -> None:
     rng = np.random.default_rng(2)
     joint = adjusted(board_rig(rng), rng)
-    assert joint.noise_px == 0.0
-    assert joint.beyond_promise == joint.scale
+    assert joint.corners.noise_px == 0.0
+    assert joint.corners.beyond_promise == joint.scale
 
 
 def errors_mm(rounds: int, monkeypatch: pytest.MonkeyPatch) -> float:
-    monkeypatch.setattr(joint_module, "NOISE_ROUNDS", rounds)
+    monkeypatch.setattr(corner_errors, "NOISE_ROUNDS", rounds)
     found: list[float] = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -79,9 +79,10 @@ def test_poses_are_better_when_corners_are_not_weighed_by_a_promise_they_break(m
 
 def test_noise_is_added_in_quadrature_and_none_changes_nothing() -> None:
     rig = board_rig(np.random.default_rng(3), n_frame=2)
-    seen: Seen = {n: dict(mine) for n, mine in noisier(rig.detections, 0.3).items()}
+    seen: Seen = {n: dict(mine) for n, mine in CornerErrors(noise_px=0.3).taken_out_of(rig.detections).items()}
     assert seen["c0"][0].sigma_px[0, 0] == pytest.approx(np.hypot(0.1, 0.3))
-    assert noisier(rig.detections, 0.0) is rig.detections
+    same = CornerErrors().taken_out_of(rig.detections)["c0"][0]
+    assert (same.sigma_px == rig.detections["c0"][0].sigma_px).all()
 
 
 # --- corners that err together --------------------------------------------------------------------------------------

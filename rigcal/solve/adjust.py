@@ -44,6 +44,7 @@ class Adjustment:
     residuals: Array  # (n, 2) predicted minus seen, in the corners' standard deviations
     scale: float  # robust standard deviation of a residual coordinate, in the corners' standard deviations
     covariance: Array  # (6 c, 6 c) of the left perturbations of all cameras, world axes; zero rows for fixed ones
+    variance: float  # of a residual coordinate in the corners' variances, larger where corners repeat each other
     steps: int
 
 
@@ -118,11 +119,13 @@ def adjust(sightings: Sightings, start: Poses, gauge: Gauge) -> Adjustment:
         gauge: Fixed cameras and frames, at least one of them.
     """
     found = optimise(_PosesOnly(sightings, gauge), start)
+    covariance, variance = _covariance(sightings, found.unknowns, gauge, KAPPA * found.scale)
     return Adjustment(
         poses=found.unknowns,
         residuals=residuals(sightings, found.unknowns),
         scale=found.scale,
-        covariance=_covariance(sightings, found.unknowns, gauge, KAPPA * found.scale),
+        covariance=covariance,
+        variance=variance,
         steps=found.steps,
     )
 
@@ -251,8 +254,8 @@ def schur(H_cam: Array, inverse: Array, E: Array) -> tuple[Array, Array]:
     return S, Y
 
 
-def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) -> Array:
-    """(6c, 6c) covariance of all cameras' left perturbations, scaled by the residuals.
+def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) -> tuple[Array, float]:
+    """(6c, 6c) covariance of all cameras' left perturbations, scaled by the residuals, and the variance used for it.
 
     For an M-estimator with psi(r) = w(r) r it is E[psi^2] / E[psi']^2 (X^T X)^-1 (Huber, "Robust statistics", 1981,
     ch. 7); for the Cauchy loss in two dimensions the mean of psi' is the mean of w^2, which here stays inside the
@@ -270,7 +273,8 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
     variance = residual_variance(system.squares, degrees_of_freedom(sightings, gauge), kappa)
     W, _ = _by_frame(sightings, system)
     _, g = _by_frame(sightings, view_sums(sightings, poses, kappa))
-    return variance * repetition(W, g, E, Y, P, variance, places(poses.T_world_target)) * P
+    variance *= repetition(W, g, E, Y, P, variance, places(poses.T_world_target))
+    return variance * P, variance
 
 
 def residual_variance(squares: Array, dof: int, kappa: float) -> float:

@@ -23,8 +23,8 @@ from aruco.pose_math import Array, Pose, invert_transform
 from aruco.rig_estimate import Placement, RigEstimate
 from aruco.uncertainty import carried
 from rigcal.solve.adjust import Gauge
-from rigcal.solve.judge import MAX_VIEW_MEDIAN, Judged, adjust_judging, confirmed
-from rigcal.solve.model_noise import model_noise_px
+from rigcal.solve.corner_errors import CornerErrors, adjust_explaining
+from rigcal.solve.judge import MAX_VIEW_MEDIAN, Judged, confirmed
 from rigcal.solve.problem import Poses, Sightings, gather, residuals
 from rigcal.solve.target_shape import refine_target
 
@@ -32,8 +32,6 @@ from rigcal.solve.target_shape import refine_target
 Detections = Mapping[str, Mapping[int, Detection]]
 # A marker whose median corner is this many times as far off as all corners is misprinted, moved, or wrong in the map.
 MAX_MARKER_MEDIAN = 5.0
-# Views that come back once the model noise is known may show more of it.
-NOISE_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,8 +41,7 @@ class JointRig:
     rig: RigEstimate
     covariance: Mapping[str, Array]  # camera -> (6, 6) of the left perturbation (rotation, translation), world axes
     scale: float  # how many times larger residuals are than the corners' sigmas and the model noise promise
-    noise_px: float  # model noise: what corners miss beyond their own sigmas
-    beyond_promise: float  # how many times larger residuals are than the corners' sigmas alone promise
+    corners: CornerErrors  # what they miss together
     rejected: Mapping[str, tuple[int, ...]]  # placed camera -> frames whose view does not fit the others
     odd_markers: Mapping[int, float]  # marker -> its median corner over that of all corners, where that is large
     steps: int
@@ -79,21 +76,15 @@ def adjust_rig(
         CalibrationError: The views contradict each other so much that no two cameras are left.
     """
     sightings, start, gauge = prepared(rig, cameras, detections, geometry, moving=moving, fixed=fixed)
-    judged = adjust_judging(sightings, start, gauge)
-    beyond_promise, total_px = judged.adjustment.scale, 0.0
-    for _ in range(NOISE_ROUNDS):
-        more_px = model_noise_px(sightings.only_views(judged.kept), judged.adjustment) if judged.kept.any() else 0.0
-        if not more_px:
-            break
-        total_px = float(np.hypot(total_px, more_px))
-        sightings = replace(sightings, sigma_px=np.hypot(sightings.sigma_px, more_px))
-        judged = adjust_judging(sightings, start, gauge)
+    found = adjust_explaining(sightings, start, gauge)
+    judged, covariance = found.judged, found.judged.adjustment.covariance
     if shape_unknown and judged.kept.any():
-        shape = refine_target(sightings.only_views(judged.kept), judged.adjustment.poses, judged.gauge, geometry)
-        judged = replace(judged, adjustment=replace(judged.adjustment, covariance=shape.covariance))
-    result = _result(rig, sightings, judged, moving)
-    beyond_promise = max(beyond_promise, result.scale)
-    return replace(result, noise_px=total_px, beyond_promise=beyond_promise, fixed=frozenset(fixed))
+        kept = found.sightings.only_views(judged.kept)
+        covariance = refine_target(kept, judged.adjustment.poses, judged.gauge, geometry).covariance
+    covariance = covariance + found.shift_covariance
+    judged = replace(judged, adjustment=replace(judged.adjustment, covariance=covariance))
+    result = _result(rig, found.sightings, judged, moving)
+    return replace(result, corners=found.errors, fixed=frozenset(fixed))
 
 
 def prepared(
@@ -166,8 +157,7 @@ def _result(rig: RigEstimate, sightings: Sightings, judged: Judged, moving: bool
         ),
         covariance={name: carried(blocks[c, :, c], T_new_world) for c, name in enumerate(names) if name not in lost},
         scale=adjustment.scale,
-        noise_px=0.0,
-        beyond_promise=adjustment.scale,
+        corners=CornerErrors(),
         rejected={name: frames for name, frames in rejected.items() if frames and name not in lost},
         odd_markers=_odd_markers(sightings, judged),
         steps=adjustment.steps,

@@ -1,6 +1,6 @@
 """What corners miss beyond their own noise: lenses that differ from their models, uneven prints, clocks that jitter.
 
-Owns      the estimate of that model noise, and adding it to the corners' standard deviations.
+Owns      the estimate of that model noise.
 
 The fit of an edge promises hundredths of a pixel; a lens model is good for tenths. Weighted by the promise alone, the
 sharpest corners decide everything although all are equally wrong. So where the residuals show more than the sigmas
@@ -9,13 +9,9 @@ promise, ``tau`` with ``tau^2 = median |r|^2 / (2 ln 2) - median sigma^2`` is ad
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-
 import numpy as np
 
 from aruco.merged_detection import RAYLEIGH_MEDIAN
-from aruco.model import Detection
 from rigcal.solve.adjust import Adjustment
 from rigcal.solve.problem import Sightings
 
@@ -38,15 +34,3 @@ def model_noise_px(sightings: Sightings, adjustment: Adjustment) -> float:
     absorbed = (adjustment.scale / max(plain, 1e-12)) ** 2
     variance = absorbed * float(np.median(squares_px)) / RAYLEIGH_MEDIAN**2
     return float(np.sqrt(max(variance - float(np.median(sightings.sigma_px**2)), 0.0)))
-
-
-def noisier(
-    detections: Mapping[str, Mapping[int, Detection]], noise_px: float
-) -> Mapping[str, Mapping[int, Detection]]:
-    """Detections whose corners are as uncertain as the lens and target models make them."""
-    if not noise_px:
-        return detections
-    return {
-        name: {f: replace(d, sigma_px=np.hypot(d.sigma_px, noise_px)) for f, d in by_frame.items()}
-        for name, by_frame in detections.items()
-    }

@@ -162,6 +162,31 @@ def view_sums(sightings: Sightings, poses: Poses, kappa: float, power: int = 1) 
     return ViewSums(square, g, squares)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DirectionSums:
+    """What a shift of every corner along a given direction adds to the normal equations of every view."""
+
+    h: Array  # (v, 6) sum of w B^T s, world axes: coupling with the target's twist
+    q: Array  # (v,) sum of w s^T s
+    t: Array  # (v,) sum of w s^T r
+
+
+def direction_sums(sightings: Sightings, poses: Poses, kappa: float, direction: Array) -> DirectionSums:
+    """Normal equations for one more unknown a view, which moves corners along ``direction`` (n, 2) [px a unit]."""
+    h = np.empty((sightings.n_views, 6))
+    q, t = np.empty((2, sightings.n_views))
+    for views, corners, r, B in _chunks(sightings, poses):
+        w = 1.0 / (1.0 + (r[0] ** 2 + r[1] ** 2) / kappa**2)
+        s = direction[corners].T / sightings.sigma_px[corners]
+        starts = sightings.start[views] - sightings.start[views.start]
+        h[views] = _view_totals(w * (B[0] * s[0] + B[1] * s[1]), starts)
+        q[views], t[views] = _view_totals(np.stack([w * (s**2).sum(axis=0), w * (s * r).sum(axis=0)]), starts).T
+    for c, T in enumerate(poses.T_world_cam):
+        mine = slice(*np.searchsorted(sightings.view_camera, [c, c + 1]))
+        h[mine] = h[mine] @ adjoint(invert_transform(T))
+    return DirectionSums(h, q, t)
+
+
 def _view_totals(values: Array, starts: NDArray[np.int64]) -> Array:
     """Sums (v, k) of values (k, n) over corners from each start to the next."""
     size, uneven = divmod(values.shape[1], len(starts))
