@@ -23,6 +23,7 @@ MAX_VIEWS = 8
 # The right resolution makes views fit by pixels better; noise and lenses do not differ between ratios by so much.
 MUCH_BETTER = 0.4
 WORTH_A_WORD_PX = 1.0
+FITS_PX = 3.0
 
 
 def other_resolution(camera: Camera, detections: Mapping[int, Detection], geometry: Mapping[int, Array]) -> str:
@@ -34,7 +35,7 @@ def other_resolution(camera: Camera, detections: Mapping[int, Detection], geomet
         return ""
     found = {ratio: _misfit_px(_scaled(camera, ratio), some, geometry) for ratio in RATIOS}
     ratio = min(found, key=lambda ratio: found[ratio])
-    if not found[ratio] < MUCH_BETTER * now_px:
+    if not found[ratio] < min(MUCH_BETTER * now_px, FITS_PX):
         return ""
     width, height = round(camera.width / ratio), round(camera.height / ratio)
     return (

@@ -178,11 +178,11 @@ def _distances_px(sightings: Sightings, poses: Poses) -> list[Array]:
 
 
 def _from_the_world(case: Case, poses: Poses, held: Frames) -> dict[str, list[Array]]:
-    target = np.broadcast_to(case.poses.T_world_target[:1], (1, 4, 4))
+    target = np.broadcast_to(poses.T_world_target[:1], (1, 4, 4))
     found: dict[str, list[Array]] = {}
     for c, camera in enumerate(case.cameras):
         by_frame = {camera.name: {f: case.detections[camera.name][f] for f in held[camera.name]}}
-        sightings = gather([camera], by_frame, case.geometry)
+        sightings = gather([camera], by_frame, case.geometry, case.noise_px)
         targets = np.repeat(target, len(sightings.frames), axis=0)
         found[camera.name] = _distances_px(sightings, Poses(poses.T_world_cam[c : c + 1], targets))
     return found
@@ -216,8 +216,10 @@ def _within_camera(case: Case) -> HeldOut | None:
     (camera,) = case.cameras
     several = {f: d for f in case.used[camera.name] if len(d := case.detections[camera.name][f]) > 1}
     turns = {f: np.arange(len(d)) % 2 == 1 for f, d in several.items()}
-    mine = gather([camera], {camera.name: {f: d.only(turns[f]) for f, d in several.items()}}, case.geometry)
-    others = gather([camera], {camera.name: {f: d.only(~turns[f]) for f, d in several.items()}}, case.geometry)
+    mine, others = (
+        gather([camera], {camera.name: {f: d.only(half[f]) for f, d in several.items()}}, case.geometry, case.noise_px)
+        for half in (turns, {f: ~mask for f, mask in turns.items()})
+    )
     if not several or mine.frames != others.frames or not mine.n_views:
         return None
     number = {f: k for k, f in enumerate(case.sightings.frames)}

@@ -38,6 +38,11 @@ class Case:
     sightings: Sightings  # of these; merged to one frame for a target that rests
     poses: Poses  # the optimum
 
+    @property
+    def noise_px(self) -> float:
+        """Model noise of every corner, beside its sigma."""
+        return self.joint.corners.noise_px
+
     def gauge(self, *, cameras: bool = False) -> Gauge:
         """Cameras that were kept carry the world; else the first of a moved target, the target at rest; or all."""
         kept = np.array([camera.name in self.joint.fixed for camera in self.cameras], dtype=bool)
@@ -69,7 +74,7 @@ def case_of(
         for name, frames in frames_of.items()
     }
     chosen = {name: {f: detections[name][f] for f in frames} for name, frames in used.items()}
-    sightings = gather(placed, chosen if moving else merged_views(detections, used), geometry)
+    sightings = gather(placed, chosen if moving else merged_views(detections, used), geometry, joint.corners.noise_px)
     T_world_cam = np.array([joint.rig.cameras[camera.name].T_world_cam for camera in placed]).reshape(-1, 4, 4)
     T_world_target = np.array([targets[f] if moving else np.eye(4) for f in sightings.frames]).reshape(-1, 4, 4)
     if not moving:
@@ -89,7 +94,8 @@ def solve_part(case: Case, frames: Frames) -> Adjustment | None:
         inside = view_mask(case, frames)
         sightings, start = case.sightings.only_views(inside), case.poses
     else:
-        sightings, start = gather(case.cameras, merged_views(case.detections, frames), case.geometry), case.poses
+        merged = merged_views(case.detections, frames)
+        sightings, start = gather(case.cameras, merged, case.geometry, case.noise_px), case.poses
     if len(np.unique(sightings.view_camera)) < len(case.cameras):
         return None
     try:

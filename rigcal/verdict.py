@@ -130,11 +130,12 @@ def _residuals(v: Validation) -> Iterator[Reading]:
     if v.patterns.focal_noticed:
         name, least = _worst(v.patterns.focal_noticed)
         distance_mm = 1e3 * least * _reach_m(v, name)
+        wrong = "by any amount" if least > 1 else f"by {100 * least:.1f} percent, {distance_mm:.0f} mm of its distance,"
         sentence = (
-            f"A focal length of camera {name} that is wrong by {100 * least:.1f} percent, {distance_mm:.0f} mm of its "
-            f"distance, would not show in these views: be sure of its camera_info.yaml, or {MORE[v.moving]}."
+            f"A focal length of camera {name} that is wrong {wrong} would not show in these views: be sure of its "
+            f"camera_info.yaml, or {MORE[v.moving]}."
         )
-        yield Reading(gate="focal length error noticed", value=100 * least, sentence=sentence)
+        yield Reading(gate="focal length error noticed", value=min(100 * least, 100.0), sentence=sentence)
     odd = v.adjusted.odd_markers
     listed = ", ".join(f"{marker} ({ratio:.0f} times)" for marker, ratio in sorted(odd.items()))
     advice = (

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from joint_rigs import Seen, SimRig, board_rig, box_rig, pair_errors
+from joint_rigs import SimRig, board_rig, box_rig, pair_errors
 from scipy.stats import chi2
 
 from aruco.model import Detection
@@ -14,8 +14,8 @@ from aruco.pose_math import Array, adjoint, invert_transform, log_se3
 from rigcal.solve import adjust as solver
 from rigcal.solve import corner_errors
 from rigcal.solve.adjust import adjust
-from rigcal.solve.corner_errors import CornerErrors
 from rigcal.solve.joint import JointRig, adjust_rig
+from rigcal.solve.problem import gather
 
 
 def disturbed(rig: SimRig, noise_px: float, rng: np.random.Generator) -> SimRig:
@@ -79,10 +79,9 @@ def test_poses_are_better_when_corners_are_not_weighed_by_a_promise_they_break(m
 
 def test_noise_is_added_in_quadrature_and_none_changes_nothing() -> None:
     rig = board_rig(np.random.default_rng(3), n_frame=2)
-    seen: Seen = {n: dict(mine) for n, mine in CornerErrors(noise_px=0.3).taken_out_of(rig.detections).items()}
-    assert seen["c0"][0].sigma_px[0, 0] == pytest.approx(np.hypot(0.1, 0.3))
-    same = CornerErrors().taken_out_of(rig.detections)["c0"][0]
-    assert (same.sigma_px == rig.detections["c0"][0].sigma_px).all()
+    sigma_px = gather(rig.cameras, rig.detections, rig.geometry, 0.3).sigma_px
+    np.testing.assert_allclose(sigma_px, np.hypot(0.1, 0.3))
+    assert (gather(rig.cameras, rig.detections, rig.geometry).sigma_px == 0.1).all()
 
 
 # --- corners that err together --------------------------------------------------------------------------------------
@@ -96,7 +95,7 @@ def normalised(shift_px: float, repetitions: int, *, forget: bool = False) -> Ar
         rig = late(board_rig(rng, n_frame=20), shift_px, rng)
         with pytest.MonkeyPatch.context() as patch:
             if forget:
-                patch.setattr(solver, "repetition", lambda *_: 1.0)
+                patch.setattr(solver, "repetition", lambda *_, **__: 1.0)
             result = adjust(rig.sightings(), rig.start(rng, 1e-3), rig.gauge())
         first = result.poses.T_world_cam[0], rig.truth.T_world_cam[0]
         blocks = result.covariance.reshape(4, 6, 4, 6)
@@ -117,6 +116,23 @@ def test_views_that_are_off_as_a_whole_widen_the_covariance() -> None:
     # that does not spread over all directions as independent corners do: half as much again.
     assert 0.5 < mean < 1.6
     assert normalised(0.5, 20, forget=True).mean() / 6 > 3
+
+
+@pytest.mark.parametrize(("n_cam", "n_frame"), [(2, 25), (3, 10)])
+def test_few_cameras_are_widened_too_when_a_frame_carries_the_world(n_cam: int, n_frame: int) -> None:
+    found: list[float] = []
+    for seed in range(12):
+        rng = np.random.default_rng(300 + seed)
+        rig = late(box_rig(rng, n_cam=n_cam, n_frame=n_frame), 0.4, rng)
+        result = adjust(rig.sightings(), rig.start(rng, 1e-3), rig.gauge())
+        T, T_true = (invert_transform(P[0]) @ P[1] for P in (result.poses.T_world_cam, rig.truth.T_world_cam))
+        blocks = result.covariance.reshape(n_cam, 6, n_cam, 6)
+        C = blocks[0, :, 0] + blocks[1, :, 1] - blocks[0, :, 1] - blocks[1, :, 0]
+        A = adjoint(invert_transform(result.poses.T_world_cam[0]))
+        xi = log_se3(T_true @ invert_transform(T))
+        found.append(float(xi @ np.linalg.solve(A @ C @ A.T, xi)) / 6)
+    # One for independent corners; without the factor tens. A scalar does not follow every direction.
+    assert 0.3 < np.median(found) < 3.0
 
 
 def test_independent_corners_are_left_alone() -> None:

@@ -16,8 +16,8 @@ from rigcal.solve.repetition import SAME_PLACE_M, places
 def test_a_place_lasts_until_the_target_has_moved() -> None:
     shifts = [0.0, 0.3, 0.9, 1.5, 1.6, 40.0, 40.1, 0.0]  # in SAME_PLACE_M
     T = np.array([exp_se3(np.array([0, 0, 0, SAME_PLACE_M * s, 0, 0])) for s in shifts])
-    assert places(T).tolist() == [0, 0, 0, 1, 1, 2, 2, 3]
-    turned = np.array([exp_se3(np.array([0, angle, 0, 0, 0, 0])) for angle in (0.0, 0.005, 0.02)])
+    assert places(T).tolist() == [0, 0, 0, 1, 1, 2, 2, 0]
+    turned = np.array([exp_se3(np.array([0, angle, 0, 0, 0, 0])) for angle in (0.0, 0.02, 0.06)])
     assert places(turned).tolist() == [0, 0, 1]
     assert places(np.empty((0, 4, 4))).tolist() == []
 

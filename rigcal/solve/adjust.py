@@ -273,7 +273,8 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
     variance = residual_variance(system.squares, degrees_of_freedom(sightings, gauge), kappa)
     W, _ = _by_frame(sightings, system)
     _, g = _by_frame(sightings, view_sums(sightings, poses, kappa))
-    variance *= repetition(W, g, E, Y, P, variance, places(poses.T_world_target))
+    place, held = places(poses.T_world_target), bool(gauge.fixed_frames.any())
+    variance *= repetition(W, g, E, Y, P, variance, place, frame_held=held)
     return variance * P, variance
 
 

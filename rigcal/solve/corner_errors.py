@@ -33,7 +33,7 @@ class CornerErrors:
     beyond_promise: float = 1.0  # how many times larger residuals are than the corners' sigmas alone promise
 
     def taken_out_of(self, detections: Mapping[str, Mapping[int, Detection]]) -> Mapping[str, Mapping[int, Detection]]:
-        """Detections with edges where they are, and sigmas as large as all errors together."""
+        """Detections with edges where they are. Model noise is not in their sigmas: averages do not lower it."""
         return {
             name: {frame: self._mended(d, self.shift_px.get(name, 0.0)) for frame, d in by_frame.items()}
             for name, by_frame in detections.items()
@@ -43,7 +43,7 @@ class CornerErrors:
         corners = detection.corners_px
         if shift_px and corners.shape[1] == 4:
             corners = corners - shift_px * outward_moves(corners)
-        return replace(detection, corners_px=corners, sigma_px=np.hypot(detection.sigma_px, self.noise_px))
+        return replace(detection, corners_px=corners)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -173,7 +173,7 @@ def _frames_of(sightings: Sightings, views: NDArray[np.bool_]) -> dict[str, tupl
 
 def _why_lost(sightings: Sightings, judged: Judged, camera: int) -> str:
     mine = sightings.view_camera == camera
-    fits = judged.view_median <= MAX_VIEW_MEDIAN
+    fits = judged.fits
     nothing_held = Gauge(np.zeros(len(sightings.cameras), dtype=bool), judged.gauge.fixed_frames)
     if confirmed(sightings, fits, nothing_held)[mine].any():
         return "the views of it that fit are connected with no other camera: put the target where two cameras see it"

@@ -29,6 +29,8 @@ from rigcal.solve.problem import Poses, Sightings, residuals
 # The median of a view's corners, in robust standard deviations of all corners. One for ordinary views; small or
 # oblique markers and imperfect intrinsics reach three or four. A wrong view is tens or hundreds off.
 MAX_VIEW_MEDIAN = 6.0
+# A lens or a clock may make all views of one camera wrong by so much: a reason to trust them less, not to lose it.
+HARMLESS_PX = 0.5
 # The start is an average of single views: it is allowed more.
 MAX_START_MEDIAN = 20.0
 MAX_ROUNDS = 5
@@ -43,6 +45,7 @@ class Judged:
     adjustment: Adjustment
     gauge: Gauge  # what did not move; cameras without a kept view among it
     kept: NDArray[np.bool_]  # (v,)
+    fits: NDArray[np.bool_]  # (v,) also those of cameras that others do not confirm, or that are tied to nothing
     view_median: Array  # (v,) of every view, kept or not, in robust standard deviations
 
 
@@ -57,22 +60,24 @@ def adjust_judging(sightings: Sightings, start: Poses, gauge: Gauge) -> Judged:
     if not len(usual):
         raise CalibrationError("No view fits the cameras' first poses: check the marker map and the intrinsics.")
     limit = MAX_START_MEDIAN * max(1.0, float(np.median(usual)))
-    poses, median = heard(sightings, start, limit)
-    kept, held = tied(sightings, median <= limit, gauge)
-    adjustment = adjust(sightings.only_views(kept), poses, held)
+    poses = heard(sightings, start, limit)
+    kept, held = tied(sightings, fitting(sightings, poses, limit), gauge)
+    adjustment, fits = adjust(sightings.only_views(kept), poses, held), kept
     for _ in range(MAX_ROUNDS):
         limit = MAX_VIEW_MEDIAN * adjustment.scale
-        poses, median = heard(sightings, adjustment.poses, limit)
-        now, now_held = tied(sightings, confirmed(sightings, median <= limit, gauge), gauge)
+        poses = heard(sightings, adjustment.poses, limit)
+        fits = fitting(sightings, poses, limit)
+        now, now_held = tied(sightings, confirmed(sightings, fits, gauge), gauge)
         settled = bool((now == kept).all())
         kept, held = now, now_held
         if settled or not kept.any():
             break
         adjustment = adjust(sightings.only_views(kept), poses, held)
-    return Judged(adjustment=adjustment, gauge=held, kept=kept, view_median=median / adjustment.scale)
+    median = view_medians(sightings, poses) / adjustment.scale
+    return Judged(adjustment=adjustment, gauge=held, kept=kept, fits=fits, view_median=median)
 
 
-def heard(sightings: Sightings, poses: Poses, limit: float) -> tuple[Poses, Array]:
+def heard(sightings: Sightings, poses: Poses, limit: float) -> Poses:
     """The poses after every frame in which at least half of the views are accused was tried again.
 
     Args:
@@ -82,15 +87,14 @@ def heard(sightings: Sightings, poses: Poses, limit: float) -> tuple[Poses, Arra
 
     Returns:
         The same with the target's pose replaced in the frames in which, without one of the cameras, it comes to lie
-        where more views fit; and the medians of all views (v,).
+        where more views fit.
     """
-    median = view_medians(sightings, poses)
-    fits = median <= limit
+    fits = fitting(sightings, poses, limit)
     accused = _count(sightings, ~fits)
     contested = (accused > 0) & (accused >= _count(sightings, fits))
     numbers = np.flatnonzero(contested)
     if not len(numbers):
-        return poses, median
+        return poses
     theirs = sightings.only_views(contested[sightings.view_frame])
     labels = tuple(sightings.frames[f] for f in numbers)
     theirs = replace(theirs, frames=labels, view_frame=np.searchsorted(numbers, theirs.view_frame))
@@ -99,19 +103,18 @@ def heard(sightings: Sightings, poses: Poses, limit: float) -> tuple[Poses, Arra
         tried = _without(camera, theirs, tried, limit)
     T_world_target = poses.T_world_target.copy()
     T_world_target[numbers] = tried.T_world_target
-    poses = Poses(poses.T_world_cam, T_world_target)
-    return poses, view_medians(sightings, poses)
+    return Poses(poses.T_world_cam, T_world_target)
 
 
 def _without(camera: int, sightings: Sightings, poses: Poses, limit: float) -> Poses:
     """Targets adjusted to all views but one camera's, where that makes more views fit."""
-    before = view_medians(sightings, poses)
-    used = np.isfinite(before) & (sightings.view_camera != camera)
+    used = np.isfinite(view_medians(sightings, poses)) & (sightings.view_camera != camera)
     if not used.any():
         return poses
     held = Gauge(np.ones(len(sightings.cameras), dtype=bool), np.zeros(len(sightings.frames), dtype=bool))
     said = adjust(sightings.only_views(used), poses, held).poses
-    more = _count(sightings, view_medians(sightings, said) <= limit) > _count(sightings, before <= limit)
+    after, before = (_count(sightings, fitting(sightings, p, limit)) for p in (said, poses))
+    more = after > before
     return Poses(poses.T_world_cam, np.where(more[:, None, None], said.T_world_target, poses.T_world_target))
 
 
@@ -122,7 +125,7 @@ def _count(sightings: Sightings, views: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 def confirmed(sightings: Sightings, fits: NDArray[np.bool_], gauge: Gauge) -> NDArray[np.bool_]:
     """Of the views (v,) that fit, those of cameras that are fixed or agree with others often enough."""
-    if len(sightings.frames) == 1:  # the target rests, and its pose is given: every view stands for itself
+    if len(sightings.frames) == 1:  # the target rests: every camera has one view, which stands for itself
         return fits
     c, f = sightings.view_camera, sightings.view_frame
     everything = np.ones(len(c), dtype=bool)
@@ -180,8 +183,24 @@ def view_medians(sightings: Sightings, poses: Poses) -> Array:
 
     Infinite with a corner behind the camera.
     """
+    return _medians(sightings, _distances(sightings, poses))
+
+
+def fitting(sightings: Sightings, poses: Poses, limit: float) -> NDArray[np.bool_]:
+    """The views (v,) whose median distance is within a limit, or harmless."""
+    distance = _distances(sightings, poses)
+    median, median_px = _medians(sightings, distance), _medians(sightings, distance * sightings.sigma_px)
+    return (median <= limit) | (median_px <= HARMLESS_PX)
+
+
+def _distances(sightings: Sightings, poses: Poses) -> Array:
+    """How far off each corner is (n,), one for one as good as its sigma promises; infinite behind the camera."""
     distance = np.linalg.norm(residuals(sightings, poses), axis=1) / RAYLEIGH_MEDIAN
-    distance = np.nan_to_num(distance, nan=np.inf)
+    return np.nan_to_num(distance, nan=np.inf)
+
+
+def _medians(sightings: Sightings, distance: Array) -> Array:
+    """The median (v,) of every view's corners (n,); infinite with an infinite one."""
     sizes = sightings.corners_per_view
     median = np.empty(sightings.n_views)
     for size in np.unique(sizes):  # views of one size at once

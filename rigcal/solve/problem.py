@@ -78,7 +78,10 @@ class Sightings:
 
 
 def gather(
-    cameras: Sequence[Camera], detections: Mapping[str, Mapping[int, Detection]], geometry: Mapping[int, Array]
+    cameras: Sequence[Camera],
+    detections: Mapping[str, Mapping[int, Detection]],
+    geometry: Mapping[int, Array],
+    noise_px: float = 0.0,
 ) -> Sightings:
     """Arrays of all corners.
 
@@ -86,6 +89,7 @@ def gather(
         cameras: In the order they are to have.
         detections: Camera -> frame -> markers; markers that the geometry lacks are ignored.
         geometry: Marker id -> (k, 3) points [m], target frame.
+        noise_px: Model noise, added to every corner's standard deviation in quadrature.
     """
     frames = tuple(sorted({frame for by_frame in detections.values() for frame in by_frame}))
     number = {frame: k for k, frame in enumerate(frames)}
@@ -105,7 +109,7 @@ def gather(
         start=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         points=_stacked([geometry[int(i)] for _, _, d in used for i in d.ids], 3),
         pixels=_stacked([d.corners_px.reshape(-1, 2) for _, _, d in used], 2),
-        sigma_px=np.concatenate([np.empty(0), *(d.sigma_px.ravel() for _, _, d in used)]),
+        sigma_px=np.hypot(np.concatenate([np.empty(0), *(d.sigma_px.ravel() for _, _, d in used)]), noise_px),
         marker=np.concatenate([np.empty(0, np.int64), *(np.repeat(d.ids, d.sigma_px.shape[1]) for _, _, d in used)]),
     )
 

@@ -17,32 +17,39 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from aruco.pose_math import Array, Pose, pose_distance
+from aruco.pose_math import Array, Pose
 
 # Each place's leverage costs a product of two matrices over all cameras: so many, evenly spread, stand for all.
 MAX_PLACES = 100
 # A place that alone decides where a camera is has nothing to disagree with: three that count alike reach 2/3.
 MIN_INDEPENDENT = 0.6
-
-
-# A target that has moved less than this is where it was: its corners lie at the same places of pixels and lens.
-SAME_PLACE_M = 5e-3
-SAME_PLACE_RAD = 0.01
+# A target that has moved less than this is where it was: its corners lie nearly at the same places of pixels and lens,
+# and a small target's pose is not known better.
+SAME_PLACE_M = 0.01
+SAME_PLACE_RAD = 0.04
 
 
 def places(T_world_target: Pose) -> NDArray[np.int64]:
-    """The place (f,) of every frame, given in time order: a new one whenever the target has moved (f, 4, 4)."""
+    """The place (f,) of every frame (f, 4, 4): that of the first frame near to it, or a new one."""
     label = np.zeros(len(T_world_target), dtype=np.int64)
-    first = 0
-    for f in range(1, len(T_world_target)):
-        turn_rad, shift_m = pose_distance(T_world_target[first], T_world_target[f])
-        moved = turn_rad > SAME_PLACE_RAD or shift_m > SAME_PLACE_M
-        first = f if moved else first
-        label[f] = label[f - 1] + moved
+    known = np.empty((0, 4, 4))
+    for f, T in enumerate(T_world_target):
+        near = _is_near(known, T)
+        label[f] = np.argmax(near) if near.any() else len(known)
+        known = known if near.any() else np.concatenate([known, T[None]])
     return label
 
 
-def repetition(W: Array, g: Array, E: Array, Y: Array, P: Array, variance: float, place: NDArray[np.int64]) -> float:
+def _is_near(known: Pose, T: Pose) -> NDArray[np.bool_]:
+    """Which of some poses (k, 4, 4) are the same place as T."""
+    shift_m = np.linalg.norm(known[:, :3, 3] - T[:3, 3], axis=1)
+    cosine = (np.einsum("kij,ij->k", known[:, :3, :3], T[:3, :3]) - 1) / 2
+    return (shift_m < SAME_PLACE_M) & (np.arccos(np.clip(cosine, -1.0, 1.0)) < SAME_PLACE_RAD)
+
+
+def repetition(
+    W: Array, g: Array, E: Array, Y: Array, P: Array, variance: float, place: NDArray[np.int64], *, frame_held: bool
+) -> float:
     """The factor on the covariance, at least one.
 
     Args:
@@ -53,6 +60,7 @@ def repetition(W: Array, g: Array, E: Array, Y: Array, P: Array, variance: float
         P: (6c, 6c) inverse of the cameras' system, zero for fixed ones.
         variance: Of a residual coordinate.
         place: (f,) frames with equal numbers may repeat each other.
+        frame_held: Whether the target of one frame carries the world: six of the unknowns are then its alone.
     """
     n_place = int(place.max(initial=-1)) + 1
     scores = np.zeros((n_place, P.shape[0]))
@@ -62,7 +70,7 @@ def repetition(W: Array, g: Array, E: Array, Y: Array, P: Array, variance: float
     some = (np.flatnonzero(place == k) for k in range(0, n_place, step))
     leverage = sum(_squared_leverage(W[f], E[f], Y[f], P) for f in some) * step
     n_free = 6 * np.count_nonzero(P.any(axis=1).reshape(-1, 6).any(axis=1))
-    if n_free - leverage <= MIN_INDEPENDENT * n_free:
+    if n_free - leverage <= MIN_INDEPENDENT * (n_free - 6 * frame_held):
         return 1.0
     return max(1.0, pull / (variance * (n_free - leverage)))
 

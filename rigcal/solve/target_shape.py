@@ -300,7 +300,8 @@ class ShapeProblem:
         P[np.ix_(free, free)] = np.linalg.inv(S[cameras, cameras][np.ix_(free, free)])
         g_frame_cam = _summed(g, rows.view_frame * n_cam + rows.view_camera, n_frame * n_cam)
         W, g = -E.reshape(n_frame, n_cam, 6, 6), g_frame_cam.reshape(n_frame, n_cam, 6)
-        return repetition(W, g, E, Y[:, cameras], P, variance, places(unknowns.poses.T_world_target))
+        place, held = places(unknowns.poses.T_world_target), bool(self.gauge.fixed_frames.any())
+        return repetition(W, g, E, Y[:, cameras], P, variance, place, frame_held=held)
 
     def parts(self, poses: Poses) -> NDArray[np.int64]:
         """Which part of the target every marker (m,) belongs to; -1 for points and for markers that are tied to none.
