@@ -208,6 +208,7 @@ class UpDecision:
     """Which way is up in the target's frame, and how sure the cameras are."""
 
     candidates: tuple[UpCandidate, ...]  # best first
+    is_guess: bool = False  # of a moved target: no several frames share the direction, it is that of one frame
 
     @property
     def up_target(self) -> Array:

@@ -114,4 +114,4 @@ def _in_world(decision: UpDecision, R_world_target: Array, shared: Array | None)
         turned[0] = UpCandidate(
             up_target=shared, ground_face=turned[0].ground_face, log_likelihoods=turned[0].log_likelihoods
         )
-    return UpDecision(candidates=tuple(turned))
+    return UpDecision(candidates=tuple(turned), is_guess=shared is None)

@@ -216,6 +216,7 @@ def _why_lost(name: str, by_camera: Mapping[str, Mapping[int, View]], links: Seq
         return f"connected only with {', '.join(linked)}, not with the rest: put the target where both groups see it"
     most = max(shared, key=lambda other: shared[other])
     return (
-        f"{shared[most]} frames shared with {most} do not agree on one pose: record more frames with two faces of the "
-        "target in view"
+        f"{shared[most]} frames shared with {most} do not agree on one pose: check that both cameras' clocks agree "
+        "(--still if they are not triggered together), and record more "
+        "frames, a board tilted, a box with two faces in view"
     )

@@ -20,6 +20,8 @@ from rigcal.solve.target_shape import RefinedTarget, refine_target
 
 # Views that a rough map kept out come back once it is corrected, and correct it a little more.
 ROUNDS = 2
+# A map is not corrected by what is known worse than a ruler measures it.
+HOPELESS_M = 0.01
 
 
 def refine_rig_target(
@@ -46,4 +48,10 @@ def refine_rig_target(
         found = refine_target(kept, judged.adjustment.poses, judged.gauge, corrected)
         corrected = found.geometry
     assert found is not None, "there is a round at least"
+    worst = max(found.sigma_m, key=lambda marker: found.sigma_m[marker], default=None)
+    if worst is not None and found.sigma_m[worst] > HOPELESS_M:
+        raise CalibrationError(
+            f"The marker map cannot be corrected: the views leave open by {1e3 * found.sigma_m[worst]:.0f} mm where "
+            f"marker {worst} is; check its ids and sizes, and record more frames in which cameras see several markers."
+        )
     return found
