@@ -1,26 +1,26 @@
 """Simulated rigs calibrated by the whole pipeline, and how far their poses are from the truth.
 
-Owns      running one rig over several seeds, pooling its errors, and metrics of them.
+Owns      calibrating rigs of several seeds, pooling their errors, and metrics of these.
 Leaves    rigs to rigcal.sim, the errors themselves to rigcal.quality.truth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from aruco.board import board_text
 from aruco.errors import CalibrationError
-from aruco.marker_geometry import Face
-from aruco.model import Recording
+from aruco.model import Calibration, Recording
 from aruco.pose_math import Array, Pose
 from benchmarks.metric import Metric
 from rigcal.config import AlignConfig, CalibrateConfig, DetectConfig
 from rigcal.pipeline import calibrate
 from rigcal.quality.truth import pair_errors, tilt_error
 from rigcal.sim import Simulation
-from rigcal.target import marker_target
+from rigcal.target import Target, board_target, marker_target
 
 UP = (0, 1, 0)
 
@@ -30,24 +30,37 @@ class MeasuredRig:
     """A recording, and what has to be known and is true about it."""
 
     recording: Recording
-    faces: Sequence[Face]
+    target: Target
     T_world_cam: Mapping[str, Pose]  # the truth
     config: CalibrateConfig
 
 
 def rig_of(simulation: Simulation) -> MeasuredRig:
-    """A simulated rig, to be calibrated upright."""
+    """A simulated rig, to be calibrated upright; with a board in the board's frame, which has no upright side."""
+    board = simulation.target.board
+    if board is None:
+        target = marker_target(simulation.faces, simulation.dictionary)
+    else:
+        target = board_target(board_text(board))
     config = CalibrateConfig(
         detect=DetectConfig(dictionary=simulation.dictionary),
-        align=AlignConfig(enabled=True),
+        align=AlignConfig(enabled=board is None),
         moving_target=simulation.rig.moving,
     )
     return MeasuredRig(
         recording=simulation.recording,
-        faces=simulation.faces,
+        target=target,
         T_world_cam=simulation.T_world_cam,
         config=config,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outcome:
+    """What became of one rig."""
+
+    calibration: Calibration | None  # None: nothing could be placed
+    T_world_cam: Mapping[str, Pose]  # the truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,25 +75,39 @@ class RigErrors:
 
 def measure_rigs(rigs: Iterable[MeasuredRig]) -> RigErrors:
     """Calibrate each rig as the command does, and compare it with its truth."""
+    return pooled(calibrated(rig) for rig in rigs)
+
+
+def calibrated(rig: MeasuredRig) -> Outcome:
+    """Calibrate a rig as the command does."""
+    try:
+        calibration = calibrate(rig.recording, rig.target, rig.config)
+    except CalibrationError:
+        calibration = None
+    return Outcome(calibration=calibration, T_world_cam=rig.T_world_cam)
+
+
+def pooled(outcomes: Iterable[Outcome]) -> RigErrors:
+    """The errors of several rigs; cameras of rigs that could not be calibrated count as not placed."""
     pairs: list[tuple[float, float]] = []
     tilts: list[float] = []
     placed = asked = 0
-    for rig in rigs:
-        asked += len(rig.T_world_cam)
-        try:
-            result = calibrate(rig.recording, marker_target(rig.faces, rig.config.detect.dictionary), rig.config)
-        except CalibrationError:
-            continue  # none of its cameras count as placed
-        placed += len(result.cameras)
-        pairs += pair_errors(result.T_world_cam, rig.T_world_cam).values()
-        tilts.append(tilt_error(result.T_world_cam, rig.T_world_cam, UP))
+    for outcome in outcomes:
+        asked += len(outcome.T_world_cam)
+        if outcome.calibration is None:
+            continue
+        T_world_cam = outcome.calibration.T_world_cam
+        placed += len(T_world_cam)
+        pairs += pair_errors(T_world_cam, outcome.T_world_cam).values()
+        if outcome.calibration.up is not None:
+            tilts.append(tilt_error(T_world_cam, outcome.T_world_cam, UP))
     return RigErrors(pairs=np.array(pairs).reshape(-1, 2), tilts=np.array(tilts), placed=placed, asked=asked)
 
 
 def rig_metrics(
     errors: RigErrors, what: str, *, prefix: str = "", limits: dict[str, float] | None = None
 ) -> list[Metric]:
-    """Median and worst errors over all pairs of all rigs, tilt, and how many cameras have a pose."""
+    """Median and worst errors over all pairs of all rigs, tilt of upright ones, and how many cameras have a pose."""
     limits = limits or {}
     turns_deg, shifts_mm = np.degrees(errors.pairs[:, 0]), 1e3 * errors.pairs[:, 1]
     tilts_deg = np.degrees(errors.tilts)
@@ -113,6 +140,7 @@ def rig_metrics(
             abs_tol=0.02 if unit == "mm" else 0.001,
         )
         for key, (statistic, values, unit, about) in statistics.items()
+        if key != "tilt_worst_deg" or len(values)
     ] + [placed]
 
 

@@ -505,7 +505,7 @@ def test_a_step_is_the_dense_one_under_the_constraint_of_the_best_fit(which: str
 
 @pytest.mark.parametrize("which", ["frame", "camera"])
 def test_the_covariance_is_the_dense_one(which: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(target_shape, "repetition", lambda *_: 1.0)
+    monkeypatch.setattr(target_shape, "repetition", lambda *_, **__: 1.0)
     problem, shape = any_problem(which)
     H, _ = dense(problem, shape, 20.0, power=2)
     inverse, _, _ = solved_densely(problem, shape, H)

@@ -17,6 +17,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from aruco.errors import CalibrationError
 from aruco.merged_detection import RAYLEIGH_MEDIAN
 from aruco.pose_math import Array, Pose, exp_so3
 from rigcal.solve.problem import Poses, Sightings, ViewSums, residuals, view_sums
@@ -24,7 +25,6 @@ from rigcal.solve.repetition import places, repetition
 
 # 95 % efficient for clean Gaussian corners (Holland and Welsch 1977: 2.385), deaf to gross errors.
 KAPPA = 2.385
-MIN_SCALE = 1e-3
 MAX_STEPS = 60
 RESCALINGS = 6
 SETTLED_SCALE = 0.02
@@ -44,6 +44,7 @@ class Adjustment:
     residuals: Array  # (n, 2) predicted minus seen, in the corners' standard deviations
     scale: float  # robust standard deviation of a residual coordinate, in the corners' standard deviations
     covariance: Array  # (6 c, 6 c) of the left perturbations of all cameras, world axes; zero rows for fixed ones
+    absorbed: float  # by how much the unknowns have lowered the squares of the residuals
     variance: float  # of a residual coordinate in the corners' variances, larger where corners repeat each other
     steps: int
 
@@ -65,6 +66,11 @@ class Problem(Protocol[Unknowns]):
     @property
     def dof(self) -> int:
         """Residuals beyond the unknowns."""
+        ...
+
+    @property
+    def least_scale(self) -> float:
+        """As that of Sightings."""
         ...
 
     def sums(self, unknowns: Unknowns, kappa: float) -> ViewSums:
@@ -100,6 +106,10 @@ class _PosesOnly:
     def dof(self) -> int:
         return degrees_of_freedom(self.sightings, self.gauge)
 
+    @property
+    def least_scale(self) -> float:
+        return self.sightings.least_scale
+
     def sums(self, unknowns: Poses, kappa: float) -> ViewSums:
         return view_sums(self.sightings, unknowns, kappa)
 
@@ -117,15 +127,24 @@ def adjust(sightings: Sightings, start: Poses, gauge: Gauge) -> Adjustment:
         sightings: Corners; every free camera needs at least one view.
         start: Poses near the optimum.
         gauge: Fixed cameras and frames, at least one of them.
+
+    Raises:
+        CalibrationError: The corners leave a camera's pose open.
     """
-    found = optimise(_PosesOnly(sightings, gauge), start)
-    covariance, variance = _covariance(sightings, found.unknowns, gauge, KAPPA * found.scale)
+    try:
+        found = optimise(_PosesOnly(sightings, gauge), start)
+        covariance, variance = _covariance(sightings, found.unknowns, gauge, KAPPA * found.scale)
+    except np.linalg.LinAlgError as error:
+        raise CalibrationError(
+            "The corners leave a camera's pose open: record more frames, with more of the target in view."
+        ) from error
     return Adjustment(
         poses=found.unknowns,
         residuals=residuals(sightings, found.unknowns),
         scale=found.scale,
         covariance=covariance,
         variance=variance,
+        absorbed=_absorbed(len(sightings.points), degrees_of_freedom(sightings, gauge)),
         steps=found.steps,
     )
 
@@ -135,12 +154,12 @@ def optimise(problem: Problem[Unknowns], start: Unknowns) -> Optimum[Unknowns]:
     unknowns, steps = start, 0
     squares, dof = problem.sums(start, np.inf).squares, problem.dof
     for _ in range(RESCALINGS):
-        scale = _scale(squares, dof)
+        scale = max(_scale(squares, dof), problem.least_scale)
         unknowns, squares, took = _minimise(problem, unknowns, KAPPA * scale)
         steps += took
-        if abs(_scale(squares, dof) - scale) < SETTLED_SCALE * scale:
+        if abs(max(_scale(squares, dof), problem.least_scale) - scale) < SETTLED_SCALE * scale:
             break
-    return Optimum(unknowns, _scale(squares, dof), steps)
+    return Optimum(unknowns, max(_scale(squares, dof), problem.least_scale), steps)
 
 
 def degrees_of_freedom(sightings: Sightings, gauge: Gauge) -> int:
@@ -153,8 +172,12 @@ def degrees_of_freedom(sightings: Sightings, gauge: Gauge) -> int:
 
 def _scale(squares: Array, dof: int) -> float:
     """Robust standard deviation of a residual coordinate; what the unknowns have absorbed is given back."""
-    absorbed = (2 * len(squares) + PRIOR_DOF) / (dof + PRIOR_DOF)
-    return max(float(np.sqrt(np.median(squares) * absorbed)) / RAYLEIGH_MEDIAN, MIN_SCALE)
+    return float(np.sqrt(np.median(squares) * _absorbed(len(squares), dof))) / RAYLEIGH_MEDIAN
+
+
+def _absorbed(n_corners: int, dof: int) -> float:
+    """By how much the unknowns have lowered the squares of residuals."""
+    return (2 * n_corners + PRIOR_DOF) / (dof + PRIOR_DOF)
 
 
 def _minimise(problem: Problem[Unknowns], unknowns: Unknowns, kappa: float) -> tuple[Unknowns, Array, int]:

@@ -16,11 +16,12 @@ from aruco.pose_math import Array
 from rigcal.solve.adjust import Gauge
 from rigcal.solve.edge_shift import EdgeShift, cost_of_not_knowing, find_shift, outward_moves, outwards, shifted
 from rigcal.solve.judge import Judged, adjust_judging
-from rigcal.solve.model_noise import model_noise_px
+from rigcal.solve.model_noise import NOTICED, model_noise_px
 from rigcal.solve.problem import Poses, Sightings
 
 # Views that come back once the model noise is known may show more of it.
-NOISE_ROUNDS = 2
+NOISE_ROUNDS = 6
+SETTLED_NOISE = 1.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,15 +94,18 @@ class _Settled:
 
 
 def _with_noise(sightings: Sightings, judged: Judged, start: Poses, gauge: Gauge) -> _Settled:
-    total_px = 0.0
+    """Adjusted under the model noise that the views which belong show; it grows as more of them do."""
+    found = _Settled(sightings, judged, 0.0)
+    if not judged.kept.any() or judged.adjustment.scale < NOTICED:
+        return found
+    own_px = float(np.median(sightings.sigma_px))
     for _ in range(NOISE_ROUNDS):
-        more_px = model_noise_px(sightings.only_views(judged.kept), judged.adjustment) if judged.kept.any() else 0.0
-        if not more_px:
+        noise_px = model_noise_px(found.sightings, found.judged, own_px)
+        if noise_px <= SETTLED_NOISE * found.noise_px:
             break
-        total_px = float(np.hypot(total_px, more_px))
-        sightings = replace(sightings, sigma_px=np.hypot(sightings.sigma_px, more_px))
-        judged = adjust_judging(sightings, start, gauge)
-    return _Settled(sightings, judged, total_px)
+        noisy = sightings.with_noise(noise_px)
+        found = _Settled(noisy, adjust_judging(noisy, start, gauge), noise_px)
+    return found
 
 
 def _errors(

@@ -1,6 +1,8 @@
 """The health of a rig before it is solved: which cameras see the target together, and where that hangs by a thread.
 
 Owns      counts of shared frames, connected parts, the weakest link, a suggestion in words.
+
+Cameras that stay where an earlier calibration put them hang together, whatever they see.
 """
 
 from __future__ import annotations
@@ -28,8 +30,8 @@ class GraphHealth:
     """Who sees the target together with whom."""
 
     shared: Mapping[tuple[str, str], int]  # pairs with at least one frame in common
-    parts: tuple[tuple[str, ...], ...]  # groups of cameras that hang together, the largest first
-    weakest: WeakestLink | None  # of the best tree of the largest part; None for a single camera
+    parts: tuple[tuple[str, ...], ...]  # groups of cameras that hang together, that of kept ones or the largest first
+    weakest: WeakestLink | None  # of the best tree of the first part; None where that needs no frames
 
     @property
     def summary(self) -> str:
@@ -37,9 +39,10 @@ class GraphHealth:
         groups = " | ".join(_listed(part) for part in self.parts)
         if len(self.parts) > 1:
             return f"cameras that see the target together: {groups}"
+        n = sum(map(len, self.parts))
         if self.weakest is None:
-            return f"one camera sees the target: {groups}"
-        link, n = self.weakest, sum(map(len, self.parts))
+            return f"one camera sees the target: {groups}" if n == 1 else f"{n} cameras that are kept see the target"
+        link = self.weakest
         return f"{n} cameras hang together; weakest link: {link.i} and {link.j}, {link.frames} shared frames"
 
     @property
@@ -74,15 +77,17 @@ def _listed(names: Collection[str]) -> str:
     return ", ".join(names)
 
 
-def graph_health(frames_of: Mapping[str, Collection[int]]) -> GraphHealth:
+def graph_health(frames_of: Mapping[str, Collection[int]], tied: Collection[str] = ()) -> GraphHealth:
     """Who sees the target together with whom.
 
     Args:
         frames_of: Camera -> frames in which it sees the target.
+        tied: Cameras that hang together without a frame.
     """
     seen = {name: set(frames_of[name]) for name in sorted(frames_of)}
     shared = {(i, j): n for i, j in combinations(seen, 2) if (n := len(seen[i] & seen[j]))}
-    part = {name: {name} for name in seen}
+    together = {name for name in seen if name in tied}
+    part = {name: together if name in together else {name} for name in seen}
     tree: list[WeakestLink] = []
     # Kruskal from the strongest link on: the last one of a part is the strongest that its weakest place has.
     for (i, j), n in sorted(shared.items(), key=lambda item: (-item[1], item[0])):
@@ -91,5 +96,6 @@ def graph_health(frames_of: Mapping[str, Collection[int]]) -> GraphHealth:
             part.update(dict.fromkeys(merged, merged))
             tree.append(WeakestLink(i=i, j=j, frames=n))
     parts = sorted({tuple(sorted(names)) for names in part.values()}, key=lambda names: (-len(names), names))
-    in_largest = [link for link in tree if parts and link.i in parts[0]]
-    return GraphHealth(shared=shared, parts=tuple(parts), weakest=in_largest[-1] if in_largest else None)
+    parts.sort(key=lambda names: together.isdisjoint(names))
+    in_first = [link for link in tree if parts and link.i in parts[0]]
+    return GraphHealth(shared=shared, parts=tuple(parts), weakest=in_first[-1] if in_first else None)

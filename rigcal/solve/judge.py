@@ -186,6 +186,11 @@ def view_medians(sightings: Sightings, poses: Poses) -> Array:
     return _medians(sightings, _distances(sightings, poses))
 
 
+def view_medians_px(sightings: Sightings, poses: Poses) -> Array:
+    """The same in pixels: the standard deviation of a coordinate of which each median speaks (v,)."""
+    return _medians(sightings, _distances(sightings, poses) * sightings.sigma_px)
+
+
 def fitting(sightings: Sightings, poses: Poses, limit: float) -> NDArray[np.bool_]:
     """The views (v,) whose median distance is within a limit, or harmless."""
     distance = _distances(sightings, poses)

@@ -17,7 +17,7 @@ with respect to a twist in camera axes, every view enters the normal equations t
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ from aruco.pose_math import Array, Pose, adjoint, invert_transform
 
 # A piece of this size fits into a processor's cache a few times over; larger ones are no faster.
 CHUNK_CORNERS = 4096
+# The residuals' scale is no smaller than this: exact corners, as tests have them, must not divide by zero.
+MIN_SCALE = 1e-3
 # The upper triangle of a symmetric 6x6 matrix.
 _ROW, _COLUMN = np.triu_indices(6)
 
@@ -45,6 +47,7 @@ class Sightings:
     pixels: Array  # (n, 2) as recorded
     sigma_px: Array  # (n,) standard deviation of a coordinate
     marker: NDArray[np.int64]  # (n,) id of the marker that a corner belongs to
+    least_scale: float = MIN_SCALE  # residuals are never taken for smaller than so many sigmas
 
     @property
     def n_views(self) -> int:
@@ -74,7 +77,17 @@ class Sightings:
             pixels=self.pixels[corners],
             sigma_px=self.sigma_px[corners],
             marker=self.marker[corners],
+            least_scale=self.least_scale,
         )
+
+    def with_noise(self, noise_px: float) -> Sightings:
+        """The same with a noise added to every corner that all corners of a view may share.
+
+        The scatter of single corners then says nothing about how wrong a view may be.
+        """
+        if not noise_px:
+            return self
+        return replace(self, sigma_px=np.hypot(self.sigma_px, noise_px), least_scale=1.0)
 
 
 def gather(
@@ -89,7 +102,7 @@ def gather(
         cameras: In the order they are to have.
         detections: Camera -> frame -> markers; markers that the geometry lacks are ignored.
         geometry: Marker id -> (k, 3) points [m], target frame.
-        noise_px: Model noise, added to every corner's standard deviation in quadrature.
+        noise_px: Model noise; see Sightings.with_noise.
     """
     frames = tuple(sorted({frame for by_frame in detections.values() for frame in by_frame}))
     number = {frame: k for k, frame in enumerate(frames)}
@@ -101,7 +114,7 @@ def gather(
     known = [(c, f, d.only(np.array([int(i) in geometry for i in d.ids], dtype=bool))) for c, f, d in rows]
     used = [(c, f, d) for c, f, d in known if len(d)]
     sizes = [d.sigma_px.size for _, _, d in used]
-    return Sightings(
+    gathered = Sightings(
         cameras=tuple(cameras),
         frames=frames,
         view_camera=np.array([c for c, _, _ in used], dtype=np.int64),
@@ -109,9 +122,10 @@ def gather(
         start=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         points=_stacked([geometry[int(i)] for _, _, d in used for i in d.ids], 3),
         pixels=_stacked([d.corners_px.reshape(-1, 2) for _, _, d in used], 2),
-        sigma_px=np.hypot(np.concatenate([np.empty(0), *(d.sigma_px.ravel() for _, _, d in used)]), noise_px),
+        sigma_px=np.concatenate([np.empty(0), *(d.sigma_px.ravel() for _, _, d in used)]),
         marker=np.concatenate([np.empty(0, np.int64), *(np.repeat(d.ids, d.sigma_px.shape[1]) for _, _, d in used)]),
     )
+    return gathered.with_noise(noise_px)
 
 
 def _stacked(parts: Sequence[Array], width: int) -> Array:

@@ -176,6 +176,11 @@ class ShapeProblem:
         return int(self.part.max()) + 1
 
     @property
+    def least_scale(self) -> float:
+        """As that of the views."""
+        return self.rows.least_scale
+
+    @property
     def dof(self) -> int:
         """Residuals beyond the unknowns; six of each part's are fixed by the map."""
         n_moving = int((self.part >= 0).sum()) - self.n_parts
