@@ -238,7 +238,10 @@ class Calibration:
     frames: Mapping[str, FrameCounts]
     notes: Mapping[str, Any] = field(default_factory=dict)  # further entries of _meta: aligned, sync, provenance
     origin: str = "target"  # what the world's origin is tied to
-    unused: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # cameras of an earlier file: their entries
+    kept: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # cameras of an earlier file: their entries
+    kept_meta: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # key of that file's _meta -> camera
+    idle: Mapping[str, str] = field(default_factory=dict)  # kept cameras of the recording that took no part: why
+    stale: frozenset[str] = frozenset()  # of these, those whose views contradict where they are kept
     parts: tuple[Calibration, ...] = ()  # cameras that nothing connects with these, each group in a world of its own
 
     @property
@@ -248,8 +251,8 @@ class Calibration:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every camera of the recording has a pose."""
-        return not self.lost
+        """Whether every camera of the recording has a pose that its views do not contradict."""
+        return not self.lost and not self.stale
 
     @property
     def is_bad(self) -> bool:

@@ -69,4 +69,5 @@ def tell(calibration: Calibration, output: Path) -> None:
         out.print(f"Wrote the corrected marker map to {beside(output, '_markers.parquet')}", markup=False)
     apart = sum(len(part.cameras) for part in calibration.parts)
     more = f", and of {apart} in worlds of their own" if apart else ""
-    out.print(f"Wrote {len(calibration.cameras)} camera poses{more} to {output}", markup=False)
+    poses = calibration.kept.keys() | calibration.T_world_cam.keys()
+    out.print(f"Wrote {len(poses)} camera poses{more} to {output}", markup=False)

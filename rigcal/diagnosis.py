@@ -37,6 +37,14 @@ MISFIT_PX, MISFIT_SHARE = 5.0, 0.005  # px, or a share of the image's width
 FAR_M = 30.0
 ROLLED_DEG = 30.0
 MIN_USED_SHARE = 0.7
+MIRRORED = (
+    "The markers show only in the mirrored image: they are seen in a mirror, or the recording is flipped; record the "
+    "target itself, and switch off mirroring in the camera's settings."
+)
+INVERTED = (
+    "The markers show only in the inverted image: they are printed white on black; print them black on white, or use a "
+    "board (--board), whose inverted prints are read."
+)
 
 
 def require_views(recording: Recording, target: Target, config: DetectConfig, seen: Mapping[str, Seen]) -> None:
@@ -71,6 +79,9 @@ def require_views(recording: Recording, target: Target, config: DetectConfig, se
             f"The images show {config.dictionary} markers {_listed(strangers)}, but the marker map has only "
             f"{_listed(geometry)}; check --markers."
         )
+    for turned, told in ((_mirrored, MIRRORED), (_inverted, INVERTED)):
+        if set(_ids_in([turned(image) for image in images], config.dictionary)) & geometry.keys():
+            raise CalibrationError(told)
     found = diagnose_dictionaries(images, geometry)
     if found:
         raise CalibrationError(
@@ -102,6 +113,14 @@ def require_kept(recording: Recording, seen: Mapping[str, Seen], kept: Collectio
         f"Of the cameras to keep, none sees the target ({', '.join(here)}): put it where one of them and a new one "
         "both see it."
     )
+
+
+def _mirrored(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def _inverted(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return 255 - image
 
 
 def _no_board(target: Target, images: list[NDArray]) -> str:
@@ -180,20 +199,24 @@ def refuse_misfits(rig: RigEstimate, residuals: Mapping[str, Reprojection], evid
         CalibrationError: None is left.
     """
     models = {camera.name: camera for camera in evidence.cameras}
-    refused = {
-        name: (
-            f"the corners lie {r.rms_px:.0f} px (RMS) from where the marker map puts them, farthest those of "
-            f"{_worst(r)}: check that map (ids, corner order, sizes) and intrinsics are this target's and camera's"
-        )
-        for name, r in residuals.items()
-        if not r.rms_px <= max(MISFIT_PX, MISFIT_SHARE * models[name].width)
-    }
+    refused = {n: why for n, r in residuals.items() if (why := _why_misfit(r, models[n]))}
     lost = {name: intrinsics_fault(models[name], evidence) or why for name, why in {**rig.lost, **refused}.items()}
     if len(refused) == len(rig.cameras):
         name = next(iter(refused))
         raise CalibrationError(f"No camera fits: camera {name}: {lost[name]}.")
     kept = {name: placement for name, placement in rig.cameras.items() if name not in refused}
     return replace(rig, cameras=kept, lost=lost)
+
+
+def _why_misfit(residuals: Reprojection, camera: Camera) -> str:
+    if not len(residuals.errors_px):
+        return "none of its views agrees with those of other cameras about where the target is"
+    if residuals.rms_px <= max(MISFIT_PX, MISFIT_SHARE * camera.width):
+        return ""
+    return (
+        f"the corners lie {residuals.rms_px:.0f} px (RMS) from where the marker map puts them, farthest those of "
+        f"{_worst(residuals)}: check that map (ids, corner order, sizes) and intrinsics are this target's and camera's"
+    )
 
 
 def is_doubtful(residuals: Reprojection) -> bool:

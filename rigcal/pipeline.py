@@ -6,39 +6,32 @@ Leaves    every step to the tools in aruco and the rooms of rigcal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from loguru import logger
 
-from aruco import alignment, moved_target, resting_target
-from aruco.errors import CalibrationError
-from aruco.marker_geometry import Face, corrected_faces
-from aruco.model import SILENT, Calibration, CameraPose, Progress, Recording
-from aruco.moved_alignment import find_up_moved
-from aruco.pose_math import Pose, make_pose
-from aruco.reprojection import Reprojection, reproject
+from aruco import alignment
+from aruco.errors import CalibrationError, InputError
+from aruco.marker_geometry import Face
+from aruco.model import SILENT, Calibration, Progress, Recording
 from aruco.rig_estimate import RigEstimate
-from aruco.uncertainty import camera_sigma, carried, least_known
 from rigcal import diagnosis, notes
-from rigcal.config import AlignConfig, CalibrateConfig, Resources
-from rigcal.detecting import OnFrame, Seen
+from rigcal.config import CalibrateConfig, Resources
+from rigcal.detecting import OnFrame
 from rigcal.evidence import Evidence, at_rest, look
-from rigcal.kept import KeptRig, kept_from_file
+from rigcal.finishing import finish
+from rigcal.kept import NOTHING_KEPT, KeptRig, kept_from_file
+from rigcal.kept_check import NOTHING_COMPARED, KeptCheck, compare_kept
+from rigcal.placing import correct_target, place_cameras
 from rigcal.preview_writer import PreviewWriter
-from rigcal.quality.gates import Quality
 from rigcal.solve.graph import GraphHealth, graph_health
-from rigcal.solve.joint import JointRig, adjust_rig
-from rigcal.solve.joint_target import refine_rig_target
+from rigcal.solve.target_shape import RefinedTarget
 from rigcal.sources import open_recordings
 from rigcal.target import Target, board_target, marker_target_from_file
-from rigcal.validation import validate
-from rigcal.verdict import depth_below_target, quality_of
 
-NOTHING_KEPT = KeptRig(T_world_cam={})
 # Called with the faces of a target whose map was corrected.
 OnTarget = Callable[[Sequence[Face]], object]
 
@@ -73,30 +66,44 @@ def calibrate(
     jobs = (resources or Resources()).jobs
     evidence = look(recording, target, config, jobs=jobs, progress=progress, on_frame=on_frame)
     diagnosis.require_views(recording, target, config.detect, evidence.seen)
-    if config.still:
-        evidence = at_rest(evidence)
-    health = _connections(evidence)
+    return calibrate_seen(at_rest(evidence) if config.still else evidence, kept=kept, on_target=on_target)
+
+
+def calibrate_seen(
+    evidence: Evidence, *, kept: KeptRig = NOTHING_KEPT, on_target: OnTarget = lambda faces: None
+) -> Calibration:
+    """The same, from what the cameras saw; see calibrate for arguments and errors."""
+    if kept.T_world_cam and evidence.config.align.enabled:
+        raise InputError("Cameras that are kept keep their world, upright or not; do not ask to turn it upright.")
+    health = _connections(evidence, kept)
+    check = _still_there(evidence, kept)
+    held = kept.only(kept.T_world_cam.keys() - check.displaced.keys())
     refined: dict[str, Any] = {}
-    first, *others = place_cameras(evidence, kept)
-    if config.refine_target:
-        evidence, refined = correct_target(first, evidence, kept)
+    first, *others = place_cameras(evidence, held)
+    if evidence.config.refine_target:
+        rough = evidence.target
+        evidence, found = correct_target(first, evidence, held)
+        refined = {"target_refined": _noted(found, rough)}
         on_target(evidence.target.faces)
-        first, *others = place_cameras(evidence, kept)
-    calibration = finish(first, evidence, kept)
+        first, *others = place_cameras(evidence, held)
+    unseen = diagnosis.cameras_without_views(evidence.recording, evidence.moments.sync, evidence.seen)
+    first = replace(first, lost={**unseen, **first.lost})
+    calibration = _first_part(first, evidence, held, check)
     about = {
         "frames": notes.frame_counts(evidence.seen),
         "sync": notes.clock(evidence.moments),
         **refined,
         **({} if health is None else {"connections": health.as_dict()}),
+        **({"kept": check.as_dict()} if check.compared else {}),
         "provenance": notes.provenance(evidence, kept),
     }
-    return replace(
+    calibration = replace(
         calibration,
-        lost={**diagnosis.cameras_without_views(recording, evidence.moments.sync, evidence.seen), **calibration.lost},
         frames={name: s.counts for name, s in evidence.seen.items()},
         notes={**calibration.notes, **about},
         parts=tuple(part for rig in others if (part := _other_part(rig, evidence)) is not None),
     )
+    return _put_back(calibration, kept, check)
 
 
 def calibrate_files(
@@ -135,91 +142,43 @@ def calibrate_files(
     )
 
 
-def _connections(evidence: Evidence) -> GraphHealth | None:
+def _connections(evidence: Evidence, kept: KeptRig) -> GraphHealth | None:
     """Who sees the moved target together with whom, said before anything is solved."""
     if not evidence.config.target_moves or len(evidence.seen) < 2:
         return None
-    health = graph_health({name: s.detections.keys() for name, s in evidence.seen.items()})
+    health = graph_health({name: s.detections.keys() for name, s in evidence.seen.items()}, tied=kept.T_world_cam)
     logger.info(health.summary)
     if health.suggestion:
         logger.warning(health.suggestion)
     return health
 
 
-def place_cameras(evidence: Evidence, kept: KeptRig) -> list[RigEstimate]:
-    """The rig from averaged views; of a moved target also the parts that nothing connects with the first.
-
-    Raises:
-        CalibrationError: No camera could be placed, or a target that should rest was moved.
-    """
-    views, scale2, known = evidence.views, evidence.scale2, kept.T_world_cam
-    diagnosis.require_kept(evidence.recording, evidence.seen, known)
-    if evidence.config.target_moves:
-        rigs = moved_target.place_parts(views, scale2, known)
-    else:
-        geometry = evidence.target.geometry
-        detections = evidence.detections
-        rigs = [resting_target.place_cameras(evidence.cameras, views, detections, geometry, scale2, known)]
-    if not rigs[0].cameras:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in rigs[0].lost.items())
-        raise CalibrationError(f"No camera could be placed. {reasons}.")
-    return rigs
+def _still_there(evidence: Evidence, kept: KeptRig) -> KeptCheck:
+    """What the views say about cameras that are to stay, as soon as it is known."""
+    if not evidence.config.joint:
+        return NOTHING_COMPARED
+    check = compare_kept(evidence, kept)
+    for contradiction in check.contradictions:
+        logger.warning(contradiction.sentence)
+    return check
 
 
-def correct_target(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> tuple[Evidence, dict[str, Any]]:
-    """The same evidence on a corrected map of the target, and what to note about it."""
-    target, seen = evidence.target, evidence.detections
-    moving, fixed = evidence.config.target_moves, kept.T_world_cam.keys()
-    found = refine_rig_target(average, evidence.cameras, seen, target.geometry, moving=moving, fixed=fixed)
-    corrected = replace(target, geometry=found.geometry, faces=corrected_faces(target.faces, found.geometry))
+def _noted(found: RefinedTarget, target: Target) -> dict[str, Any]:
+    """What to note about a corrected map, its warnings said."""
     note = notes.corrected_target(found, target.geometry)
     for sentence in note["warnings"]:
         logger.warning(sentence)
-    return evidence.with_target(corrected), {"target_refined": note}
+    return note
 
 
-def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> Calibration:
-    """One connected part of the rig: adjusted, checked, turned upright if that is wished.
-
-    Raises:
-        CalibrationError: The views contradict each other, or up is ambiguous.
-    """
-    config, target = evidence.config, evidence.target
-    moving, fixed = config.target_moves, kept.T_world_cam.keys()
-    joint = None
-    if config.joint:
-        joint = adjust_rig(
-            average,
-            evidence.cameras,
-            evidence.detections,
-            target.geometry,
-            moving=moving,
-            fixed=fixed,
-            shape_unknown=config.refine_target,
-        )
-    rig = average if joint is None else joint.rig
-    seen = evidence.detections if joint is None else joint.corners.taken_out_of(evidence.detections)
-    used = {name: {f: seen[name][f] for f in p.frames} for name, p in rig.cameras.items()}
-    residuals = reproject({camera.name: camera for camera in evidence.cameras}, rig, used, target.geometry)
-    rig = diagnosis.refuse_misfits(rig, residuals, evidence)
-    T_aligned_world, about = align(rig, target.faces, config.align, moving=moving)
-    rig = rig.turned(T_aligned_world[:3, :3])
-    if joint is not None:
-        about["adjusted"] = notes.adjustment(joint)
-        told = replace(joint, rig=replace(joint.rig, lost=rig.lost))
-        about["quality"] = assess(average, told, rig, evidence).as_dict()
-    unmoved = kept if fixed & rig.cameras.keys() else NOTHING_KEPT
-    for name in fixed & rig.lost.keys():
-        logger.warning("camera {} keeps its pose, but took no part: {}", name, rig.lost[name])
-    return Calibration(
-        cameras=_camera_poses(rig, evidence, residuals, joint, T_aligned_world, unmoved),
-        lost={name: reason for name, reason in rig.lost.items() if name not in unmoved.T_world_cam},
-        up=config.align.up_axis if config.align.enabled else unmoved.up,
-        origin=str(unmoved.world.get("origin", "target")),
-        frames={name: evidence.seen[name].counts for name in rig.cameras},
-        notes=about,
-        unused={name: entry for name, entry in unmoved.entries.items() if name not in rig.cameras},
-    )
+def _first_part(rig: RigEstimate, evidence: Evidence, held: KeptRig, check: KeptCheck) -> Calibration:
+    """The part in the world of the kept cameras, if there are any."""
+    try:
+        return finish(rig, evidence, held, check)
+    except CalibrationError as error:
+        if not check.contradictions:
+            raise
+        raise CalibrationError(" ".join([*(c.sentence for c in check.contradictions), str(error)])) from error
 
 
 def _other_part(rig: RigEstimate, evidence: Evidence) -> Calibration | None:
@@ -231,71 +190,14 @@ def _other_part(rig: RigEstimate, evidence: Evidence) -> Calibration | None:
         return None
 
 
-def assess(average: RigEstimate, joint: JointRig, rig: RigEstimate, evidence: Evidence) -> Quality:
-    """The verdict, from what was held out; ``rig`` is the finished one, in its upright world if it has one."""
-    config, geometry = evidence.config, evidence.target.geometry
-    seen = evidence.detections
-    validation = validate(average, joint, evidence.cameras, seen, geometry, moving=config.target_moves)
-    up = (0, 1 if config.align.up_axis == "+y" else -1, 0)
-    below = depth_below_target(rig, geometry, up=up) if config.align.enabled else None
-    return quality_of(validation, below_target_m=below)
-
-
-def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, moving: bool) -> tuple[Pose, dict[str, Any]]:
-    """The turn T_aligned_world into an upright world, and what to note about it; the identity unless asked for."""
-    if not config.enabled:
-        return np.eye(4), {}
-    T_world_cam = {name: placement.T_world_cam for name, placement in rig.cameras.items()}
-    wish = {"ground_face": config.ground_face, "ground_marker_id": config.ground_marker_id}
-    if moving:
-        decision = find_up_moved(T_world_cam, rig.T_world_target, faces, **wish)
-    else:
-        decision = alignment.find_up(T_world_cam, faces, **wish)
-    aligned = alignment.align_world(T_world_cam, decision, up_axis=config.up_axis)
-    note = {
-        "ground_face": decision.ground_face,
-        "up_in_target": [float(x) for x in decision.up_target],
-        "margin": decision.margin,
-        "camera_up": {name: [float(-x) for x in T[:3, 1]] for name, T in aligned.T_world_cam.items()},
-    }
-    return make_pose(aligned.R_align, np.zeros(3)), {"aligned": note}
-
-
-def _camera_poses(
-    rig: RigEstimate,
-    evidence: Evidence,
-    residuals: Mapping[str, Reprojection],
-    joint: JointRig | None,
-    T_aligned_world: Pose,
-    kept: KeptRig,
-) -> tuple[CameraPose, ...]:
-    """The finished cameras, in order of their names."""
-    seen, config = evidence.seen, evidence.config.align
-    up = np.array([0.0, 1.0 if config.up_axis == "+y" else -1.0, 0.0]) if config.enabled else None
-    unmoved = kept.T_world_cam
-    doubtful = [c for c in evidence.cameras if c.name in rig.cameras and diagnosis.is_doubtful(residuals[c.name])]
-    faults = {camera.name: diagnosis.intrinsics_fault(camera, evidence) for camera in doubtful}
-    known = {} if joint is None else {n: S for n, S in joint.covariance.items() if n not in unmoved}
-    return tuple(
-        CameraPose(
-            camera=name,
-            T_world_cam=placement.T_world_cam,
-            n_frames=len(placement.frames),
-            n_markers=len({i for f in placement.frames for i in seen[name].detections[f].ids.tolist()}),
-            rms_px=residuals[name].rms_px,
-            spread_m=placement.spread_m,
-            spread_rad=placement.spread_rad,
-            covariance=carried(known[name], T_aligned_world) if name in known else kept.covariance.get(name),
-            least_known=_least_known(name, rig, known[name], T_aligned_world, seen[name]) if name in known else "",
-            kept=name in unmoved,
-            warnings=tuple(diagnosis.warnings(placement, residuals[name], seen[name], up, faults.get(name, ""))),
-        )
-        for name, placement in sorted(rig.cameras.items())
+def _put_back(calibration: Calibration, kept: KeptRig, check: KeptCheck) -> Calibration:
+    """The result with every camera of the earlier file where that has it, whether it took part or not."""
+    idle = {name: why for name, why in calibration.lost.items() if name in kept.entries}
+    return replace(
+        calibration,
+        cameras=tuple(c for c in calibration.cameras if c.kept or c.camera not in kept.entries),
+        lost={name: why for name, why in calibration.lost.items() if name not in kept.entries},
+        kept=kept.entries,
+        kept_meta=kept.meta,
+        idle={**idle, **calibration.idle, **check.displaced},
     )
-
-
-def _least_known(name: str, rig: RigEstimate, covariance: np.ndarray, T_aligned_world: Pose, seen: Seen) -> str:
-    """The least observable direction of a camera in words; turns count at the distance of the target."""
-    sigma = camera_sigma(carried(covariance, T_aligned_world), rig.cameras[name].T_world_cam)
-    reach_m = float(np.median([np.linalg.norm(view.best.T_cam_target[:3, 3]) for view in seen.views]))
-    return least_known(name, sigma, reach_m)

@@ -24,10 +24,12 @@ from aruco.rig_estimate import RigEstimate
 from rigcal.quality import holdout
 from rigcal.quality.lengths import Lengths, measure_lengths
 from rigcal.quality.patterns import Corners, Tested, search_patterns
+from rigcal.quality.timing import Timing
 from rigcal.solve.adjust import Adjustment, adjust
 from rigcal.solve.joint import Detections, JointRig
 from rigcal.solve.problem import Poses, Sightings, gather, residuals, view_sums
 from rigcal.validation_case import Case, Frames, case_of, merged_views, solve_part, view_mask
+from rigcal.validation_timing import timing_of
 
 # Predicting from all other cameras costs a small solve a camera: as many frames as a median needs.
 MAX_PREDICTED_VIEWS = 100
@@ -78,6 +80,7 @@ class Validation:
     weakest: holdout.Link | None  # of a moved target
     reprojection_px: Mapping[str, float]  # RMS of the solved corners
     left_out: Mapping[str, tuple[int, ...]]  # camera -> frames whose markers took no part
+    timing: Timing | None = None  # of a moved target, where its motion tells
 
 
 def validate(
@@ -89,6 +92,7 @@ def validate(
     *,
     moving: bool,
     share: float = 0.2,
+    times_s: Mapping[int, float] | None = None,
 ) -> Validation:
     """Measure a calibration on what it has not used.
 
@@ -102,6 +106,7 @@ def validate(
         geometry: Marker id -> (k, 3) points [m], target frame.
         moving: Whether the target has a pose of its own in every frame.
         share: Of the frames, to be held out; fewer where a camera or a link would not be left enough.
+        times_s: When each frame was taken; without it, frames are thought to follow each other evenly.
     """
     detections = adjusted.corners.taken_out_of(detections)
     case = case_of(rig_average, adjusted, cameras, detections, geometry, moving)
@@ -125,16 +130,17 @@ def validate(
         odd_even=_split(case, [slice(0, None, 2), slice(1, None, 2)]),
         early_late=_split(case, None),
         patterns=_patterns(case),
-        weakest=holdout.weakest_link(case.used) if moving else None,
+        weakest=holdout.weakest_link(case.used, adjusted.fixed) if moving else None,
         reprojection_px=_reprojection(case),
         left_out={name: _left_out(detections[name], frames, geometry) for name, frames in case.used.items()},
+        timing=timing_of(case, cameras, times_s),
     )
 
 
 def _held_frames(case: Case, share: float) -> dict[str, tuple[int, ...]]:
     if not case.moving:
         return {name: holdout.every_nth(frames, share) for name, frames in case.used.items()}
-    held = set(holdout.frames_to_hold_out(case.used, share))
+    held = set(holdout.frames_to_hold_out(case.used, share, tied=case.joint.fixed))
     if not held:
         logger.debug("no frame of the moved target can be spared: nothing is held out")
     return {name: tuple(f for f in frames if f in held) for name, frames in case.used.items()}
@@ -255,7 +261,7 @@ def _split(case: Case, parts: Sequence[slice] | None) -> tuple[Split, ...]:
         frames = frames[:: max(1, case.sightings.n_views // MAX_SPLIT_VIEWS)]
         slices = parts or [slice(0, len(frames) // 2), slice(len(frames) // 2, None)]
         sets = [set(frames[s]) for s in slices]
-        if len(case.cameras) < 2 or not holdout.halves_hang_together(case.used, sets):
+        if len(case.cameras) < 2 or not holdout.halves_hang_together(case.used, sets, case.joint.fixed):
             return ()
         halves = [{name: tuple(f for f in mine if f in s) for name, mine in case.used.items()} for s in sets]
     else:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aruco.errors import CalibrationError
 from aruco.merged_detection import merge_detections
 from aruco.model import Camera, Detection
 from aruco.pose_math import Array
@@ -100,7 +101,7 @@ def solve_part(case: Case, frames: Frames) -> Adjustment | None:
         return None
     try:
         return adjust(sightings, start, case.gauge())
-    except np.linalg.LinAlgError:
+    except CalibrationError:
         return None
 
 

@@ -14,7 +14,9 @@ import numpy as np
 from aruco.pose_math import Array, Pose, transform_points
 from aruco.rig_estimate import RigEstimate
 from aruco.uncertainty import camera_sigma, least_known
-from rigcal.quality.gates import Measured, Quality, Reading, judge
+from rigcal.depth_scale import DepthScale
+from rigcal.kept_check import NOTHING_COMPARED, KeptCheck
+from rigcal.quality.gates import GATES, Measured, Quality, Reading, judge
 from rigcal.solve.repetition import places
 from rigcal.validation import Split, Validation
 
@@ -26,6 +28,8 @@ SCALE_REMARK = (
     "The scale is that of the marker map: images cannot show a map that is wrong by one factor, so measure the side of "
     "one printed marker."
 )
+# Factory calibrations are good to about this share of the focal length.
+BELIEVED_SHARE = 0.005
 CHECK_INPUT = "check that the marker map and every camera_info.yaml belong to this recording"
 ROUGH_MAP = "; --refine-target corrects a map that is only roughly measured"
 MORE = {
@@ -34,15 +38,28 @@ MORE = {
 }
 
 
-def quality_of(validation: Validation, *, below_target_m: Mapping[str, float] | None = None) -> Quality:
+def quality_of(
+    validation: Validation,
+    *,
+    below_target_m: Mapping[str, float] | None = None,
+    kept: KeptCheck = NOTHING_COMPARED,
+    depth_scale: DepthScale | None = None,
+    up_is_guess: bool = False,
+    target_estimated: bool = False,
+) -> Quality:
     """The verdict.
 
     Args:
         validation: The numbers.
         below_target_m: In an upright world, camera -> how far it stands below the target (``depth_below_target``).
+        kept: What the views say about cameras that an earlier calibration placed.
+        depth_scale: What depth cameras say of the marker map's scale, where there are any.
+        up_is_guess: Whether up is that of a single frame of a moved target.
+        target_estimated: Whether the marker map was corrected by the same frames.
     """
     v, joint = validation, validation.adjusted
     readings = [
+        *_timing(v),
         *_sigmas(v),
         *_residuals(v),
         *_held_out(v),
@@ -50,30 +67,54 @@ def quality_of(validation: Validation, *, below_target_m: Mapping[str, float] | 
         *_splits(v, v.odd_even, "split-half", "Odd and even frames"),
         *_splits(v, v.early_late, "early-late", "The first and the second half of the recording"),
         *_views(v),
-        *_kept(v),
+        *_kept(v, kept),
         *_heights(below_target_m or {}),
+        *_scale(depth_scale),
+        *_up(up_is_guess),
     ]
     return judge(
         Measured(
             readings=readings,
             cameras=tuple(joint.rig.cameras),
-            lost={name: why for name, why in joint.rig.lost.items() if name not in joint.fixed},
-            checked=checked_cameras(v),
+            lost={n: why for n, why in joint.rig.lost.items() if n not in joint.fixed and n not in kept.displaced},
+            checked=checked_cameras(v, target_estimated=target_estimated),
             to_get_checked=_to_get_checked(v),
-            pattern=v.patterns.clearest,
-            remarks=(SCALE_REMARK,),
+            # Motion bends residuals in all ways: what they look like then is no evidence for anything else.
+            pattern=None if _taken_apart(v) else v.patterns.clearest,
+            remarks=(*_remarks(depth_scale), _intrinsics_remark(v)),
         )
     )
 
 
-def checked_cameras(v: Validation) -> frozenset[str]:
-    """The cameras that a check looked at which its own corners did not decide."""
+def checked_cameras(v: Validation, *, target_estimated: bool = False) -> frozenset[str]:
+    """The cameras that a check looked at which its own corners did not decide.
+
+    Lengths of a map that the same frames corrected check nothing.
+    """
     checked: set[str] = set()
     if v.held_out is not None and v.held_out.from_others:
         checked |= set(v.held_out.median_px)
-    if v.lengths is not None and v.lengths_held_out and v.lengths.n >= MIN_LENGTHS:
+    if v.lengths is not None and v.lengths_held_out and not target_estimated and v.lengths.n >= MIN_LENGTHS:
         checked |= set(v.lengths.cameras)
     return frozenset(checked)
+
+
+def _intrinsics_remark(v: Validation) -> str:
+    """What every figure takes for granted, in millimetres."""
+    name, reach_m = max(((name, _reach_m(v, name)) for name in v.adjusted.rig.cameras), key=lambda pair: pair[1])
+    return (
+        "Intrinsics are believed: half a percent of focal length is "
+        f"{1e3 * BELIEVED_SHARE * reach_m:.0f} mm of the distance of camera {name}."
+    )
+
+
+def _up(is_guess: bool) -> Iterator[Reading]:
+    sentence = (
+        "Up is that of a single frame, because the target does not lie level in several: put it down on the floor a "
+        "few times, or name the level face with --ground-face."
+    )
+    if is_guess:
+        yield Reading(gate="up from one frame only", value=1.0, sentence=sentence)
 
 
 def depth_below_target(
@@ -99,6 +140,18 @@ def _to_get_checked(v: Validation) -> str:
 def _worst(values: Mapping[str, float]) -> tuple[str, float]:
     name = max(values, key=lambda key: math.inf if math.isnan(values[key]) else values[key])
     return name, values[name]
+
+
+def _taken_apart(v: Validation) -> bool:
+    """Whether frames that were not taken at one moment are what is wrong."""
+    gate = GATES["frames taken apart"]
+    return v.timing is not None and v.timing.is_clear and gate.exceeded(v.timing.error_px, gate.good)
+
+
+def _timing(v: Validation) -> Iterator[Reading]:
+    if v.timing is not None:
+        px = v.timing.error_px if v.timing.is_clear else 0.0
+        yield Reading(gate="frames taken apart", value=px, sentence=v.timing.sentence)
 
 
 def _sigmas(v: Validation) -> Iterator[Reading]:
@@ -202,6 +255,8 @@ def _views(v: Validation) -> Iterator[Reading]:
     )
     yield Reading(gate="rejected views", value=100 * share, sentence=sentence)
     moved = [told for name, p in cameras.items() if (told := bumped(name, p.frames, _rejected(v, name)))]
+    if _taken_apart(v):  # the target began or ceased to move
+        moved = []
     yield Reading(gate="cameras moved while recorded", value=float(len(moved)), sentence=" ".join(moved))
     name, share = _worst({name: p.n_ambiguous / max(p.n_views, 1) for name, p in cameras.items()})
     sentence = (
@@ -236,16 +291,22 @@ def _n_places(v: Validation) -> int:
     return int(places(np.array([targets[frame] for frame in sorted(targets)])).max(initial=-1)) + 1
 
 
-def _kept(v: Validation) -> Iterator[Reading]:
+def _kept(v: Validation, kept: KeptCheck) -> Iterator[Reading]:
+    """Cameras that stand elsewhere than their file says; who of several is not said unless it is known."""
+    if kept.compared:
+        sizes_mm = [1e3 * c.size_m for c in kept.contradictions]
+        sentence = " ".join(c.sentence for c in kept.contradictions)
+        yield Reading(gate="kept cameras displaced", value=max(sizes_mm, default=0.0), sentence=sentence)
     if not v.adjusted.fixed:
         return
     lost = {name: why for name, why in v.adjusted.rig.lost.items() if name not in v.rig.lost}
     misfits = {name: why for name, why in lost.items() if name in v.adjusted.fixed}
-    told = "; ".join(f"camera {name} ({why})" for name, why in misfits.items())
+    told = "; ".join(f"camera {name} ({why})" for name, why in misfits.items() if name not in kept.doubtful)
     sentence = (
-        f"No longer where the file to keep puts it: {told}; if it was moved since, take it out of that file and run "
-        "again, which places it anew."
+        f"Kept cameras whose views do not fit: {told}; if one of the kept cameras was moved since, take it out of the "
+        "file that keeps it and run again, which places it anew."
     )
+    sentence = sentence if told else " ".join(c.sentence for c in kept.contradictions)
     yield Reading(gate="kept cameras that no longer fit", value=float(len(misfits)), sentence=sentence)
 
 
@@ -281,3 +342,37 @@ def _heights(below_target_m: Mapping[str, float]) -> Iterator[Reading]:
         "upside down or mirrored; check the order of corners in the marker map and pass --ground-face."
     )
     yield Reading(gate="camera below the target", value=depth, sentence=sentence)
+
+
+def _scale(depth: DepthScale | None) -> Iterator[Reading]:
+    if depth is None:
+        return
+    told = "Depth cameras contradict each other about the size of everything"
+    if not math.isnan(depth.scale):
+        off = 100 * depth.scale
+        way = "larger" if off > 0 else "smaller"
+        sentence = (
+            f"{_witness(depth)} says everything is {abs(off):.3g} percent {way} than the marker map makes it: measure "
+            "the side of one printed marker and correct the map (or check the depth_scale in every camera_info.yaml)."
+        )
+        yield Reading(gate="scale against depth", value=abs(off), sentence=sentence)
+        told = "Depth that differs from what the poses predict, and not as other cameras' does"
+    listed = ", ".join(f"camera {name} {100 * (depth.cameras[name].ratio - 1):+.3g} percent" for name in depth.odd)
+    sentence = f"{told}: {listed}; check depth_scale, camera_matrix and depth_camera_matrix in its camera_info.yaml."
+    yield Reading(gate="cameras whose depth contradicts the others", value=float(len(depth.odd)), sentence=sentence)
+
+
+def _witness(depth: DepthScale) -> str:
+    agreeing = [name for name in depth.cameras if name not in depth.odd]
+    return "Depth" if len(agreeing) > 1 else f"Depth of camera {agreeing[0]}, the only one to go by,"
+
+
+def _remarks(depth: DepthScale | None) -> tuple[str, ...]:
+    """About the scale; none where a reading already says what is wrong with it."""
+    if depth is None or math.isnan(depth.scale):
+        return (SCALE_REMARK,)
+    gate, percent = GATES["scale against depth"], 100 * abs(depth.scale)
+    if gate.exceeded(percent, gate.good):
+        return ()
+    within = max(percent, 100 * depth.sigma)
+    return (f"{_witness(depth)} agrees with the scale of the marker map within {within:.1f} percent.",)

@@ -35,3 +35,20 @@ def test_one_camera_has_no_link() -> None:
     assert health.weakest is None
     assert health.suggestion == ""
     assert health.as_dict()["weakest_link"] is None
+
+
+def test_cameras_that_are_kept_hang_together_without_a_frame() -> None:
+    frames = {"a": range(4), "b": range(4), "x": range(10, 30), "y": range(10, 30), "z": range(10, 30)}
+    assert graph_health(frames).parts[0] == ("x", "y", "z")
+    health = graph_health({**frames, "c": range(5, 8), "d": [30]}, tied={"a", "c", "elsewhere"})
+    # The part of the kept cameras carries the world, however small.
+    assert health.parts == (("a", "b", "c"), ("x", "y", "z"), ("d",))
+    assert health.weakest is not None
+    assert (health.weakest.i, health.weakest.j, health.weakest.frames) == ("a", "b", 4)
+    tied = graph_health({"a": range(8), "b": range(8), "c": range(20, 28), "d": range(20, 28)}, tied={"a", "c"})
+    assert tied.parts == (("a", "b", "c", "d"),)
+    assert tied.suggestion == ""
+    assert (
+        graph_health({"a": range(4), "b": range(5, 9)}, tied={"a", "b"}).summary
+        == "2 cameras that are kept see the target"
+    )

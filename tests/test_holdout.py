@@ -74,3 +74,15 @@ def test_halves_must_each_connect_all_cameras() -> None:
     assert halves_hang_together(seen, [range(0, 10, 2), range(1, 10, 2)])
     assert not halves_hang_together(seen, [range(5), range(5, 10)])
     assert not halves_hang_together(seen, [range(10), []])
+
+
+def test_cameras_that_are_kept_need_no_link() -> None:
+    seen = {"a": range(10), "b": range(10), "c": range(20, 30), "d": range(20, 30)}
+    assert frames_to_hold_out(seen, 0.2) == ()
+    assert len(frames_to_hold_out(seen, 0.2, tied={"a", "c"})) == 4
+    halves = [[*range(0, 10, 2), *range(20, 30, 2)], [*range(1, 10, 2), *range(21, 30, 2)]]
+    assert not halves_hang_together(seen, halves)
+    assert halves_hang_together(seen, halves, {"a", "c"})
+    assert weakest_link(seen) == Link("a", "c", 0)
+    assert weakest_link(seen, {"a", "c"}) == Link("c", "d", 10)
+    assert weakest_link({"a": range(3), "b": range(5, 8)}, {"a", "b"}) is None

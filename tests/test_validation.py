@@ -166,8 +166,9 @@ def test_a_good_rig_is_good(case: Case, seed: int) -> None:
     quality = calibrated(replace(case, seed=seed)).quality
     assert quality.verdict == "good", told(quality)
     assert all(check.passed for check in quality.checks)
-    assert len(quality.reasons) == 1  # where the scale comes from is said in any case
-    assert "measure the side of one printed marker" in quality.reasons[0]
+    scale, intrinsics = quality.reasons  # what is taken for granted is said in any case
+    assert "measure the side of one printed marker" in scale
+    assert "half a percent of focal length" in intrinsics
 
 
 def test_held_out_frames_of_a_good_rig_lie_as_far_off_as_noise() -> None:

@@ -28,20 +28,27 @@ def document(calibration: Calibration) -> dict[str, Any]:
     """The content of an extrinsics file."""
     world = {"up": UP_VECTORS[calibration.up] if calibration.up else None, "origin": calibration.origin}
     meta = {"format": FORMAT, "version": VERSION, "world": world, **calibration.notes}
-    known = {c.camera: c.covariance for c in calibration.cameras if c.covariance is not None}
+    meta.update({key: dict(of_camera) for key, of_camera in calibration.kept_meta.items() if of_camera})
+    fresh = {c.camera: c.covariance for c in calibration.cameras if c.covariance is not None and not c.kept}
+    known = {name: [float(x) for x in covariance.ravel()] for name, covariance in fresh.items()}
     if known:
-        meta["covariance"] = {name: [float(x) for x in covariance.ravel()] for name, covariance in known.items()}
+        meta["covariance"] = dict(sorted({**meta.get("covariance", {}), **known}.items()))
     if calibration.lost:
         meta["without_pose"] = dict(calibration.lost)
+    if calibration.idle:
+        meta["took_no_part"] = dict(calibration.idle)
     if calibration.parts:
         meta["parts"] = [document(part) for part in calibration.parts]
-    cameras = {camera.camera: _entry(camera) for camera in calibration.cameras}
-    return {**dict(sorted({**calibration.unused, **cameras}.items())), "_meta": meta}
+    cameras = {c.camera: _entry(c, calibration.kept.get(c.camera, {})) for c in calibration.cameras}
+    return {**dict(sorted({**calibration.kept, **cameras}.items())), "_meta": meta}
 
 
-def _entry(camera: CameraPose) -> dict[str, Any]:
+def _entry(camera: CameraPose, kept: Mapping[str, Any]) -> dict[str, Any]:
+    """A camera's entry; of one that was kept what its file says, beside what is new."""
     return {
-        "pose": pose_text(camera.T_world_cam),
+        **kept,
+        # The text, not the numbers: what is kept is kept to the bit, signs of zeros among it.
+        "pose": kept.get("pose", pose_text(camera.T_world_cam)),
         "frames": camera.n_frames,
         "markers": camera.n_markers,
         "rms_px": camera.rms_px,
@@ -77,19 +84,24 @@ def read_poses(path: Path) -> dict[str, Pose]:
     Raises:
         InputError: The file cannot be read or an entry has no rigid pose; the message names file and camera.
     """
-    return {name: _pose(entry, f"{path}: camera {name}") for name, entry in _cameras(read_json(path), path).items()}
+    return poses_of(read_json(path), path)
+
+
+def poses_of(content: Mapping[str, Any], path: Path) -> dict[str, Pose]:
+    """The same, of a file that was read; see read_poses."""
+    return {name: _pose(entry, f"{path}: camera {name}") for name, entry in _cameras(content, path).items()}
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The object at the root of a JSON file.
 
     Raises:
-        InputError: There is no such file, it is too large, or it holds something else.
+        InputError: There is no such file, it is too large, or it holds something else, numbers that are none among it.
     """
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"{path}: over {MAX_FILE_BYTES >> 20} MiB, which is not an extrinsics file.")
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_finite, parse_float=_finite)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
     except (ValueError, RecursionError) as error:
@@ -97,6 +109,14 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: not an extrinsics file: its root is not an object of cameras.")
     return content
+
+
+def _finite(text: str) -> float:
+    """A number; JSON has neither NaN nor Infinity, and Python would read 1e999 as the latter."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not a finite number")
+    return value
 
 
 def _cameras(content: Mapping[str, Any], path: Path) -> dict[str, Any]:

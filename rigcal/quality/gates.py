@@ -84,6 +84,10 @@ GATES: dict[str, Gate] = {
         # Printers and rulers are good for half a percent; five percent is a wrong marker size.
         Gate("length scale error", "percent", 0.5, 3.0),
         Gate("length error", "mm", 3.0, 15.0),
+        # Stereo depth of one camera is off by a percent, the mean of several by less; beyond four it is the map.
+        Gate("scale against depth", "percent", 2.0, 4.0),
+        # Its poses may still be right: depth took no part in them.
+        Gate("cameras whose depth contradicts the others", "", 0.0, math.inf),
         # Rays of one corner, from cameras that are right, meet as well as corners are found.
         Gate("ray miss", "px", 1.0, 4.0),
         # Half the frames know a pose 1.4 times worse, two halves differ 1.4 times more, and so do two cameras: with the
@@ -104,6 +108,9 @@ GATES: dict[str, Gate] = {
         Gate("cameras moved while recorded", "", 0.0, 0.0),
         # They carry the world: one that has moved bends everything that is tied to it.
         Gate("kept cameras that no longer fit", "", 0.0, 0.0),
+        # New cameras are off by as much. Two good calibrations of a rig differ by a few tenths of a millimetre, which
+        # harms nobody; at 10 mm a depth camera's surfaces, known to 5 mm, fall apart into two.
+        Gate("kept cameras displaced", "mm", 1.0, 10.0),
         # The adjustment resolves ambiguous views by others, as long as there are others.
         Gate("ambiguous views", "percent", 90.0, math.inf),
         # Corners of markers that lie five times as far off as others show a map that is wrong there.
@@ -118,13 +125,22 @@ GATES: dict[str, Gate] = {
         Gate("cameras checked independently", "percent", 100.0, 0.0, at_least=True),
         # Patterns says what is worth a word: 10 mm at 2 m. Twice that is as far off as a bad sigma.
         Gate("residual pattern", "times what is tolerable", 1.0, 2.0),
+        # What motion adds to a view. Half a pixel in all directions averages out over frames; 2.9 px in a real
+        # recording put cameras 20 mm off.
+        Gate("frames taken apart", "px", 0.5, 2.0),
         # Intrinsics of another resolution, lens or camera are off by two percent and more: that must not stay hidden.
         # Good ones, off by less than half a percent, do not show and need not.
         Gate("focal length error noticed", "percent", 2.0, math.inf),
+        # A target held askew tilts the world by as much; nothing in the images tells.
+        Gate("up from one frame only", "", 0.0, math.inf),
         # A target on a table has cameras below it; cameras in a mirrored world, or one upside down, stand deeper.
         Gate("camera below the target", "m", 0.5, 1.5),
     )
 }
+
+
+# What bends a calibration is told before what that looks like.
+CAUSES = frozenset({"frames taken apart", "residual pattern", "kept cameras displaced"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +171,7 @@ def judge(measured: Measured) -> Quality:
     checks, reasons = [], []
     worst: Verdict = "good"
     # A cause is told before its symptoms, then what makes it bad.
-    for reading in sorted(readings, key=lambda r: (r.gate != "residual pattern", not _is_bad(r))):
+    for reading in sorted(readings, key=lambda r: (r.gate not in CAUSES, not _is_bad(r))):
         gate = GATES[reading.gate]
         failed = gate.exceeded(reading.value, gate.good)
         if failed:

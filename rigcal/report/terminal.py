@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+# What comes first matters most; a page of symptoms hides it.
+MAX_REASONS = 6
+
 
 def console(*, stderr: bool = False) -> Console:
     """A terminal to print to; plain and wide enough for tables where there is none."""
@@ -32,8 +35,10 @@ def show_calibration(out: Console, calibration: Calibration) -> None:
     for name, reason in calibration.lost.items():
         out.print(f"no pose: camera {name}: {reason}", markup=False)
     _show_target(out, calibration)
-    for name in calibration.unused:
-        out.print(f"kept: camera {name}: as its file says, not seen by this recording", markup=False)
+    for name in sorted(calibration.kept.keys() - calibration.T_world_cam.keys()):
+        why = calibration.idle.get(name)
+        told = "not in this recording" if why is None else f"it took no part: {why}"
+        out.print(f"kept: camera {name}: as its file says; {told}", markup=False)
     _show_clock(out, calibration)
     _show_verdict(out, calibration)
     out.print(_world(calibration), markup=False)
@@ -63,7 +68,7 @@ def _table(calibration: Calibration) -> Table:
             f"{camera.rms_px:.3f}",
             "-" if alone else f"{1e3 * camera.spread_m:.2f}",
             "-" if alone else f"{math.degrees(camera.spread_rad):.3f}",
-            *_known_to(camera),
+            *(_known_to(camera) if adjusted else ()),
             *(f"{value:.3f}" for value in camera.T_world_cam[:3, 3]),
         )
     return table
@@ -84,7 +89,7 @@ def _known_to(camera: CameraPose) -> tuple[str, ...]:
     if camera.kept:
         return "kept", "kept"
     if camera.covariance is None:
-        return ()
+        return "-", "-"
     sigma = camera_sigma(camera.covariance, camera.T_world_cam)
     return f"{1e3 * sigma.total_m:.2f}", f"{math.degrees(sigma.total_rad):.3f}"
 
@@ -120,13 +125,16 @@ def _show_verdict(out: Console, calibration: Calibration) -> None:
     if not quality:
         return
     out.print(f"Verdict: {quality['verdict']}", markup=False)
-    for reason in quality["reasons"]:
+    *reasons, last = quality["reasons"]
+    for reason in [*reasons[:MAX_REASONS], last]:
         out.print(f"  - {reason}", markup=False)
+    if len(reasons) > MAX_REASONS:
+        out.print(f"  ({len(reasons) - MAX_REASONS} more under _meta.quality)", markup=False)
 
 
 def _world(calibration: Calibration) -> str:
-    if any(camera.kept for camera in calibration.cameras):
-        return "World: that of the cameras that were kept."
+    if calibration.kept:
+        return "World: that of the cameras that were kept; what others are known to is relative to these."
     if calibration.up is None:
         return "World: the target's frame; which way is up is not known (--auto-align turns it upright)."
     way = "up, against gravity" if calibration.up == "+y" else "down, along gravity (ZED Fusion's frame)"
