@@ -70,25 +70,29 @@ def require_views(recording: Recording, target: Target, config: DetectConfig, se
         raise CalibrationError(
             f"No image shows {config.min_markers} markers of the map at once, at most {most}; lower --min-markers."
         )
-    if not target.dictionary:
-        raise CalibrationError(_no_board(target, images))
+    missing = _no_marker(target, config.dictionary, images) if target.dictionary else _no_board(target, images)
+    raise CalibrationError(missing)
+
+
+def _no_marker(target: Target, dictionary: str, images: list[NDArray[np.uint8]]) -> str:
+    """Why no marker of the map was found: what the images show instead."""
     geometry = target.geometry
-    strangers = _ids_in(images, config.dictionary)
+    strangers = _ids_in(images, dictionary)
     if strangers:
-        raise CalibrationError(
-            f"The images show {config.dictionary} markers {_listed(strangers)}, but the marker map has only "
+        return (
+            f"The images show {dictionary} markers {_listed(strangers)}, but the marker map has only "
             f"{_listed(geometry)}; check --markers."
         )
     for turned, told in ((_mirrored, MIRRORED), (_inverted, INVERTED)):
-        if set(_ids_in([turned(image) for image in images], config.dictionary)) & geometry.keys():
-            raise CalibrationError(told)
+        if set(_ids_in([turned(image) for image in images], dictionary)) & geometry.keys():
+            return told
     found = diagnose_dictionaries(images, geometry)
     if found:
-        raise CalibrationError(
-            f"No {config.dictionary} marker was found, but markers of the map were in {_listed_counts(found)} in the "
-            "first frames; pass the right one with --aruco-dictionary."
+        return (
+            f"No {dictionary} marker was found, but markers of the map were in {_listed_counts(found)} in the first "
+            "frames; pass the right one with --aruco-dictionary."
         )
-    raise CalibrationError(
+    return (
         f"No marker of any dictionary was found in the first frames (ids of the map: {_listed(geometry)}); check that "
         "the target is in view, sharp, and larger than about 15 pixels."
     )

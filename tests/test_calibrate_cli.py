@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -381,3 +382,13 @@ def test_help_does_not_load_heavy_packages() -> None:
 
 def test_the_shipped_maps_load() -> None:
     assert {face.name for face in load_faces(BOX)} == {"bottom", "back", "top", "front", "left", "right"}
+
+
+@pytest.mark.parametrize(("spoil", "word"), [(lambda i: i[:, ::-1], "mirrored image"), (lambda i: 255 - i, "inverted")])
+def test_mirrored_and_inverted_markers_are_named(
+    copy: Path, tmp_path: Path, spoil: Callable[[np.ndarray], np.ndarray], word: str
+) -> None:
+    for camera in range(4):
+        for path in images(copy, camera):
+            cv2.imwrite(str(path), spoil(cv2.imread(str(path))))
+    assert_one_sentence(calibrate(copy, tmp_path / "out.json"), word)
