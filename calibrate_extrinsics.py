@@ -12,7 +12,6 @@ import click
 if TYPE_CHECKING:
     from aruco.marker_geometry import Face
     from aruco.model import Calibration
-    from rigcal.config import CalibrateConfig
 
 DOUBTFUL = 3  # exit code: poses were written, but not of every camera, or they are called bad
 
@@ -114,7 +113,7 @@ def _run(given: dict[str, Any]) -> Calibration:
         calibration = calibrate_files(
             [*given["svo"], *given["inputs"]],
             given["markers"],
-            _config(given),
+            cli.calibrate_config(given),
             board=given["board"],
             fix=given["fix"],
             jobs=given["jobs"],
@@ -126,30 +125,6 @@ def _run(given: dict[str, Any]) -> Calibration:
         save_faces(corrected_map, faces[0])
     native.write_extrinsics(given["output"], calibration)
     return calibration
-
-
-def _config(given: dict[str, Any]) -> CalibrateConfig:
-    from rigcal.config import AlignConfig, CalibrateConfig, DetectConfig, FrameConfig
-
-    return CalibrateConfig(
-        frames=FrameConfig(
-            sync_tolerance_ms=given["sync_tolerance_ms"],
-            sample_interval=given["sample_interval"],
-            max_samples=given["max_samples"],
-        ),
-        detect=DetectConfig(dictionary=given["aruco_dictionary"], min_markers=given["min_markers"]),
-        align=AlignConfig(
-            enabled=given["auto_align"],
-            ground_face=given["ground_face"],
-            ground_marker_id=given["ground_marker_id"],
-            up_axis=given["up_axis"],
-        ),
-        moving_target=given["moving_target"],
-        still=given["still"],
-        joint=given["joint"],
-        refine_target=given["refine_target"],
-        seed=given["seed"],
-    )
 
 
 if __name__ == "__main__":

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 from loguru import logger
 
 from aruco.errors import OutputError, RigError
 from aruco.model import Calibration
+from rigcal.config import AlignConfig, CalibrateConfig, DetectConfig, FrameConfig
 from rigcal.report.progress import showing_progress
 from rigcal.report.terminal import console, show_calibration
 
@@ -34,6 +36,29 @@ def telling_errors(*, debug: bool) -> Iterator[None]:
         raise click.ClickException(str(error)) from error
     except KeyboardInterrupt:
         raise click.ClickException("interrupted.") from None
+
+
+def calibrate_config(given: Mapping[str, Any]) -> CalibrateConfig:
+    """The knobs of a calibration from the options of the command."""
+    return CalibrateConfig(
+        frames=FrameConfig(
+            sync_tolerance_ms=given["sync_tolerance_ms"],
+            sample_interval=given["sample_interval"],
+            max_samples=given["max_samples"],
+        ),
+        detect=DetectConfig(dictionary=given["aruco_dictionary"], min_markers=given["min_markers"]),
+        align=AlignConfig(
+            enabled=given["auto_align"],
+            ground_face=given["ground_face"],
+            ground_marker_id=given["ground_marker_id"],
+            up_axis=given["up_axis"],
+        ),
+        moving_target=given["moving_target"],
+        still=given["still"],
+        joint=given["joint"],
+        refine_target=given["refine_target"],
+        seed=given["seed"],
+    )
 
 
 def refuse_inputs(output: Path, recordings: Sequence[Path], markers: Path | None, kept: Path | None = None) -> None:

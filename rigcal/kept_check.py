@@ -29,8 +29,8 @@ from rigcal.quality.gates import GATES
 from rigcal.solve.joint import JointRig, adjust_rig
 
 # Squared distance over what the covariances promise, over six: one on average. Cameras that nobody moved stay below 3
-# in simulated rigs whose frames err by up to 0.3 px, and reach 7 in halves of a real recording with poor intrinsics,
-# whose errors differ with the place of the target. With corners good to 0.05 px, one 3 mm elsewhere is at 22 and more.
+# in simulated rigs whose frames err by up to 0.3 px, and below 6 in halves of real recordings, whose errors differ with
+# the place of the target. With corners good to 0.05 px, a camera that stands 3 mm elsewhere is at 36 and more.
 MAX_OVER_COVARIANCE = 12.0
 # A file that does not say how good it is may be worse than the views: its sigmas count as so many times theirs.
 UNKNOWN_SIGMA = 2.0
@@ -170,12 +170,11 @@ def _differences(rig: JointRig, kept: KeptRig, names: Sequence[str]) -> dict[tup
 
 
 def _differ(rig: JointRig, kept: KeptRig, name: str, reference: str) -> _Difference:
-    to_file = _to_file(rig, kept, reference)
+    to_file = kept.T_world_cam[reference] @ invert_transform(rig.rig.cameras[reference].T_world_cam)
     T_seen: Pose = to_file @ rig.rig.cameras[name].T_world_cam
     T_file = kept.T_world_cam[name]
     D = T_file @ invert_transform(T_seen)
-    covariance = _covariance(rig, kept, name) + _covariance(rig, kept, reference)
-    xi = log_se3(D)
+    xi, covariance = log_se3(D), _covariance(rig, kept, name, reference, to_file)
     middle = np.mean([(to_file @ T)[:3, 3] for T in rig.rig.T_world_target.values()], axis=0)
     turn, shift = pose_distance(T_seen, T_file)
     return _Difference(
@@ -186,32 +185,33 @@ def _differ(rig: JointRig, kept: KeptRig, name: str, reference: str) -> _Differe
     )
 
 
-def _to_file(rig: JointRig, kept: KeptRig, name: str) -> Pose:
-    """The way from the rig's world to the file's, if a camera stands where the file puts it."""
-    return kept.T_world_cam[name] @ invert_transform(rig.rig.cameras[name].T_world_cam)
-
-
-def _covariance(rig: JointRig, kept: KeptRig, name: str) -> Array:
-    """(6, 6) of the way to the file."""
-    seen = carried(rig.covariance[name], _to_file(rig, kept, name))
-    return seen + kept.covariance.get(name, UNKNOWN_SIGMA**2 * seen)
+def _covariance(rig: JointRig, kept: KeptRig, name: str, reference: str, to_file: Pose) -> Array:
+    """(6, 6) of a difference, in the file's world: that of the views and that of the file."""
+    both = (name, reference)
+    apart = sum(rig.covariance[n] for n in both) - rig.common[name, reference] - rig.common[reference, name]
+    seen = carried(apart, to_file)
+    # What both cameras of the file have in common, it does not say: their sum is too large rather than too small.
+    known = all(n in kept.covariance for n in both)
+    return seen + (sum(kept.covariance[n] for n in both) if known else UNKNOWN_SIGMA**2 * seen)
 
 
 def _contradictions(
     group: Sequence[str], differences: Mapping[tuple[str, str], _Difference], file: str
 ) -> Iterator[Contradiction]:
-    """Who disagrees: the minority, if more than half agree with one of them, otherwise all that disagree."""
-    apart = [(i, j) for i, j in permutations(group, 2) if differences[i, j].is_real or differences[j, i].is_real]
-    against = {r: [i for i, j in apart if j == r] for r in group}
-    # Of references that equally many agree with the one that they agree with best.
-    total = {r: sum(d.over_covariance for (_, j), d in differences.items() if j == r) for r in group}
-    reference = min(group, key=lambda r: (len(against[r]), total[r]))
-    if 2 * len(against[reference]) < len(group):
-        for name in against[reference]:
+    """Who disagrees: the minority, if more than half agree with each other and no other half does, or all that do."""
+    apart = {(i, j) for i, j in permutations(group, 2) if differences[i, j].is_real or differences[j, i].is_real}
+    if not apart:
+        return
+    agreeing = {r: tuple(i for i in group if (i, r) not in apart) for r in group}
+    united = {names for names in agreeing.values() if apart.isdisjoint(permutations(names, 2))}
+    majorities = [names for names in united if 2 * len(names) > len(group)]
+    if len(majorities) == 1:
+        reference = next(r for r in group if agreeing[r] == majorities[0])
+        for name in (n for n in group if n not in majorities[0]):
             yield _told(file, (name,), differences[name, reference])
     else:
-        worst = max((differences[pair] for pair in apart), key=lambda d: d.size_m)
-        yield _told(file, tuple(name for name in group if against[name]), worst)
+        worst = max((differences[pair] for pair in sorted(apart)), key=lambda d: d.size_m)
+        yield _told(file, tuple(name for name in group if any(name in pair for pair in apart)), worst)
 
 
 def _told(file: str, cameras: tuple[str, ...], d: _Difference) -> Contradiction:

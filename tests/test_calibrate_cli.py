@@ -390,5 +390,7 @@ def test_mirrored_and_inverted_markers_are_named(
 ) -> None:
     for camera in range(4):
         for path in images(copy, camera):
-            cv2.imwrite(str(path), spoil(cv2.imread(str(path))))
+            image = cv2.imread(str(path))
+            assert image is not None
+            cv2.imwrite(str(path), spoil(image))
     assert_one_sentence(calibrate(copy, tmp_path / "out.json"), word)

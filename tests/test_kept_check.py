@@ -106,6 +106,19 @@ def test_of_two_that_contradict_each_other_neither_is_blamed(shift_m: float, ver
     assert all(why.startswith("cameras c0 and c1 of old.json contradict") for why in found.idle.values())
 
 
+def test_a_third_that_knows_little_decides_nothing() -> None:
+    rig = standing(2)
+    kept = displaced(earlier_file(rig, THREE, 2), "c1", 3e-3)
+    once, rng = recorded(rig, 2), np.random.default_rng(2)
+    blurred = {
+        f: replace(noisy(d, rng, 2.0), sigma_px=np.full_like(d.sigma_px, 2.0))
+        for f, d in list(once.detections["c2"].items())[:4]
+    }
+    check = compare_kept(seen_by(once.with_detections({**once.detections, "c2": blurred}), moving_target=True), kept)
+    assert sorted(check.compared) == list(THREE)
+    assert [c.cameras for c in check.contradictions] == [TWO]
+
+
 def test_two_that_leave_nothing_to_adjust_are_not_blamed_either() -> None:
     rig = standing(35)
     kept = displaced(earlier_file(rig, TWO, 35), "c1", 0.05)

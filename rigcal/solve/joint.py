@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ class JointRig:
 
     rig: RigEstimate
     covariance: Mapping[str, Array]  # camera -> (6, 6) of the left perturbation (rotation, translation), world axes
+    common: Mapping[tuple[str, str], Array]  # (camera, camera) -> (6, 6) covariance of the one with the other
     scale: float  # how many times larger residuals are than the corners' sigmas and the model noise promise
     corners: CornerErrors  # what they miss together
     rejected: Mapping[str, tuple[int, ...]]  # placed camera -> frames whose view does not fit the others
@@ -156,6 +158,11 @@ def _result(rig: RigEstimate, sightings: Sightings, judged: Judged, moving: bool
             world_frame=world_frame,
         ),
         covariance={name: carried(blocks[c, :, c], T_new_world) for c, name in enumerate(names) if name not in lost},
+        common={
+            (names[i], names[j]): carried(blocks[i, :, j], T_new_world)
+            for i, j in permutations(range(len(names)), 2)
+            if not {names[i], names[j]} & lost.keys()
+        },
         scale=adjustment.scale,
         corners=CornerErrors(),
         rejected={name: frames for name, frames in rejected.items() if frames and name not in lost},
