@@ -1,0 +1,83 @@
+"""Depth that is wrong by a known bias is put right, and the simulator means the same by it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aruco.depth_bias import DepthBias, bias_from_dict
+from aruco.errors import InputError
+from rigcal.sim.noise import DepthBias as SimulatedBias
+from rigcal.sim.noise import DepthNoise, measure_depth
+
+FOCAL_BASELINE = 84.0  # f = 700 px, B = 0.12 m
+
+
+def test_what_the_simulator_bends_is_straightened() -> None:
+    true = np.linspace(1.0, 6.0, 60, dtype=np.float32).reshape(6, 10)
+    bent = measure_depth(
+        true,
+        np.zeros_like(true),
+        DepthNoise(sigma_px=0.0, dropout=0.0),
+        SimulatedBias(scale=0.003, disparity_px=0.15),
+        FOCAL_BASELINE,
+        np.random.default_rng(0),
+    )
+    bias = DepthBias(scale=0.003, inverse_depth=0.15 / FOCAL_BASELINE, focal_baseline=FOCAL_BASELINE)
+    # Single precision of the simulator: a few micrometres at 6 m.
+    np.testing.assert_allclose(bias.corrected(bent), true, atol=2e-5)
+    # The tolerance bites: with the other sign it is centimetres off at 6 m.
+    assert np.abs(DepthBias(scale=-0.003, inverse_depth=-0.15 / FOCAL_BASELINE).corrected(bent) - true).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    "bias",
+    [
+        DepthBias(scale=0.01, inverse_depth=0.002),
+        DepthBias(model="offset", scale=-0.02, offset_m=0.03),
+    ],
+)
+def test_derivatives_are_those_of_finite_differences(bias: DepthBias) -> None:
+    z = np.array([0.8, 2.0, 5.0])
+    second = "offset_m" if bias.model == "offset" else "inverse_depth"
+    h = 1e-6
+    for row, name in zip(bias.derivative(z), ("scale", second)):
+        values = {"model": bias.model, "scale": bias.scale, second: getattr(bias, second)}
+        up, down = (DepthBias(**{**values, name: values[name] + s * h}).corrected(z) for s in (1, -1))
+        np.testing.assert_allclose(row, (up - down) / (2 * h), rtol=1e-6)
+
+
+def test_nothing_becomes_something() -> None:
+    bias = DepthBias(inverse_depth=0.5)
+    corrected = bias.corrected(np.array([np.nan, 0.0, -1.0, 3.0, 1.0]))
+    # At 3 m the corrected inverse depth is below zero: beyond infinity.
+    assert np.isnan(corrected[:4]).all()
+    assert corrected[4] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    "bias",
+    [
+        DepthBias(scale=0.004, inverse_depth=0.0015, focal_baseline=FOCAL_BASELINE),
+        DepthBias(scale=0.004, inverse_depth=0.0015),
+        DepthBias(model="offset", scale=-0.001, offset_m=0.012),
+    ],
+)
+def test_the_file_keeps_it(bias: DepthBias) -> None:
+    back = bias_from_dict(bias.as_dict(), "a.json: camera c")
+    z = np.linspace(0.5, 8.0, 9)
+    np.testing.assert_allclose(back.corrected(z), bias.corrected(z), rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "entry", [None, {}, {"scale": 0.1}, {"scale": "x"}, {"disparity_px": 1.0}, {"scale": 1e9, "offset_m": 0.0}]
+)
+def test_other_entries_are_refused_with_a_sentence(entry: object) -> None:
+    with pytest.raises(InputError):
+        bias_from_dict(entry, "a.json: camera c")
+
+
+@pytest.mark.parametrize("wrong", [{"scale": float("nan")}, {"scale": 0.9}, {"focal_baseline": 0.0}])
+def test_numbers_that_are_no_bias_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError):
+        DepthBias(**wrong)  # pyright: ignore[reportArgumentType]
