@@ -217,6 +217,6 @@ def _why_lost(name: str, by_camera: Mapping[str, Mapping[int, View]], links: Seq
     most = max(shared, key=lambda other: shared[other])
     return (
         f"{shared[most]} frames shared with {most} do not agree on one pose: check that both cameras' clocks agree "
-        "(--still if they are not triggered together), and record more "
-        "frames, a board tilted, a box with two faces in view"
+        "(--still if they are not triggered together), and record more frames, "
+        "a board tilted, a box with two faces in view"
     )

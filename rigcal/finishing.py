@@ -29,8 +29,9 @@ from rigcal.detecting import Seen
 from rigcal.evidence import Evidence
 from rigcal.kept import KeptRig
 from rigcal.kept_check import NOTHING_COMPARED, KeptCheck
+from rigcal.placing import adjust_placed
 from rigcal.quality.gates import Quality
-from rigcal.solve.joint import JointRig, adjust_rig
+from rigcal.solve.joint import JointRig
 from rigcal.validation import validate
 from rigcal.verdict import depth_below_target, quality_of
 
@@ -82,17 +83,7 @@ def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig, check: KeptC
 
 def _solve(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> _Solved:
     config, geometry, fixed = evidence.config, evidence.target.geometry, kept.T_world_cam.keys()
-    joint = None
-    if config.joint:
-        joint = adjust_rig(
-            average,
-            evidence.cameras,
-            evidence.detections,
-            geometry,
-            moving=config.target_moves,
-            fixed=fixed,
-            shape_unknown=config.refine_target,
-        )
+    joint = adjust_placed(average, evidence, kept) if config.joint else None
     rig = average if joint is None else joint.rig
     seen = evidence.detections if joint is None else joint.corners.taken_out_of(evidence.detections)
     used = {name: {f: seen[name][f] for f in p.frames} for name, p in rig.cameras.items()}

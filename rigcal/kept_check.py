@@ -24,9 +24,9 @@ from aruco.pose_math import Array, Pose, invert_transform, log_se3, pose_distanc
 from aruco.uncertainty import carried
 from rigcal.evidence import Evidence
 from rigcal.kept import KeptRig
-from rigcal.placing import correct_target, place_cameras
+from rigcal.placing import adjust_placed, place_with_target
 from rigcal.quality.gates import GATES
-from rigcal.solve.joint import JointRig, adjust_rig
+from rigcal.solve.joint import JointRig
 
 # Squared distance over what the covariances promise, over six: one on average. Cameras that nobody moved stay below 3
 # in simulated rigs whose frames err by up to 0.3 px, and below 6 in halves of real recordings, whose errors differ with
@@ -130,21 +130,9 @@ def compare_kept(evidence: Evidence, kept: KeptRig) -> KeptCheck:
 
 def _with_one_held(evidence: Evidence, anchor: KeptRig) -> JointRig | None:
     """The rig adjusted with a single kept camera held; None where that fails."""
-    config, fixed = evidence.config, anchor.T_world_cam.keys()
     try:
-        average, *_ = place_cameras(evidence, anchor)
-        if config.refine_target:
-            evidence, _ = correct_target(average, evidence, anchor)
-            average, *_ = place_cameras(evidence, anchor)
-        return adjust_rig(
-            average,
-            evidence.cameras,
-            evidence.detections,
-            evidence.target.geometry,
-            moving=config.target_moves,
-            fixed=fixed,
-            shape_unknown=config.refine_target,
-        )
+        evidence, (average, *_), _ = place_with_target(evidence, anchor)
+        return adjust_placed(average, evidence, anchor)
     except CalibrationError as error:
         logger.debug("kept cameras cannot be compared: {}", error)
         return None

@@ -25,7 +25,7 @@ from rigcal.evidence import Evidence, at_rest, look
 from rigcal.finishing import finish
 from rigcal.kept import NOTHING_KEPT, KeptRig, kept_from_file
 from rigcal.kept_check import NOTHING_COMPARED, KeptCheck, compare_kept
-from rigcal.placing import correct_target, place_cameras
+from rigcal.placing import place_with_target
 from rigcal.preview_writer import PreviewWriter
 from rigcal.solve.graph import GraphHealth, graph_health
 from rigcal.solve.target_shape import RefinedTarget
@@ -78,14 +78,12 @@ def calibrate_seen(
     health = _connections(evidence, kept)
     check = _still_there(evidence, kept)
     held = kept.only(kept.T_world_cam.keys() - check.displaced.keys())
+    rough = evidence.target
+    evidence, (first, *others), found = place_with_target(evidence, held)
     refined: dict[str, Any] = {}
-    first, *others = place_cameras(evidence, held)
-    if evidence.config.refine_target:
-        rough = evidence.target
-        evidence, found = correct_target(first, evidence, held)
+    if found is not None:
         refined = {"target_refined": _noted(found, rough)}
         on_target(evidence.target.faces)
-        first, *others = place_cameras(evidence, held)
     unseen = diagnosis.cameras_without_views(evidence.recording, evidence.moments.sync, evidence.seen)
     first = replace(first, lost={**unseen, **first.lost})
     calibration = _first_part(first, evidence, held, check)

@@ -1,6 +1,6 @@
 """The rig from averaged views: where everything starts.
 
-Owns      which way of averaging a target asks for, correcting the target's map with it.
+Owns      which way of averaging a target asks for, correcting the target's map with it, handing both to the adjustment.
 Leaves    the averages to aruco, adjusting them to rigcal.solve.
 """
 
@@ -15,6 +15,7 @@ from aruco.rig_estimate import RigEstimate
 from rigcal import diagnosis
 from rigcal.evidence import Evidence
 from rigcal.kept import KeptRig
+from rigcal.solve.joint import JointRig, adjust_rig
 from rigcal.solve.joint_target import refine_rig_target
 from rigcal.solve.target_shape import RefinedTarget
 
@@ -40,6 +41,33 @@ def place_cameras(evidence: Evidence, kept: KeptRig) -> list[RigEstimate]:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in rigs[0].lost.items())
         raise CalibrationError(f"No camera could be placed. {reasons}.")
     return rigs
+
+
+def place_with_target(evidence: Evidence, kept: KeptRig) -> tuple[Evidence, list[RigEstimate], RefinedTarget | None]:
+    """The averaged rig, on a corrected map of the target if that is wished: the evidence then holds it.
+
+    Raises:
+        CalibrationError: As place_cameras, or the map cannot be corrected.
+    """
+    rigs = place_cameras(evidence, kept)
+    if not evidence.config.refine_target:
+        return evidence, rigs, None
+    evidence, found = correct_target(rigs[0], evidence, kept)
+    return evidence, place_cameras(evidence, kept), found
+
+
+def adjust_placed(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> JointRig:
+    """An averaged rig adjusted; raises as joint.adjust_rig."""
+    config = evidence.config
+    return adjust_rig(
+        average,
+        evidence.cameras,
+        evidence.detections,
+        evidence.target.geometry,
+        moving=config.target_moves,
+        fixed=kept.T_world_cam.keys(),
+        shape_unknown=config.refine_target,
+    )
 
 
 def correct_target(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> tuple[Evidence, RefinedTarget]:

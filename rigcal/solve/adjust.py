@@ -221,7 +221,7 @@ def left_moved(T: Pose, xi: Array) -> Pose:
 
 def _solve(sightings: Sightings, system: ViewSums, gauge: Gauge, damping: float) -> tuple[Array, Array]:
     """The damped step of cameras (c, 6) and targets (f, 6)."""
-    H_cam, g_cam, H_target, g_target, E = _blocks(sightings, system)
+    H_cam, g_cam, H_target, g_target, E = blocks(sightings, system)
     H_cam = damped(H_cam, damping)
     inverse = inverse_targets(damped(H_target, damping), gauge)
     S, Y = schur(H_cam, inverse, E)
@@ -234,22 +234,20 @@ def _solve(sightings: Sightings, system: ViewSums, gauge: Gauge, damping: float)
     return d_cam.reshape(-1, 6), d_target
 
 
-def _blocks(sightings: Sightings, system: ViewSums) -> tuple[Array, Array, Array, Array, Array]:
+def blocks(sightings: Sightings, system: ViewSums) -> tuple[Array, Array, Array, Array, Array]:
     """H and g of cameras and targets, and the coupling E (f, 6 c, 6)."""
-    W, g = _by_frame(sightings, system)
+    W, g = by_frame(sightings, system.W), by_frame(sightings, system.g)
     n_frame, n_cam = W.shape[:2]
     E = -W.reshape(n_frame, 6 * n_cam, 6)
     # A camera's derivative is the target's with the other sign.
     return W.sum(axis=0), -g.sum(axis=0), W.sum(axis=1), g.sum(axis=1), E
 
 
-def _by_frame(sightings: Sightings, system: ViewSums) -> tuple[Array, Array]:
-    """W (f, c, 6, 6) and g (f, c, 6); every pair of a frame and a camera is one view, or none."""
-    n_cam, n_frame = len(sightings.cameras), len(sightings.frames)
-    view = (sightings.view_frame, sightings.view_camera)
-    W, g = np.zeros((n_frame, n_cam, 6, 6)), np.zeros((n_frame, n_cam, 6))
-    W[view], g[view] = system.W, system.g
-    return W, g
+def by_frame(sightings: Sightings, of_views: Array) -> Array:
+    """Values of the views (v, ...) as (f, c, ...), zero where there is none: a frame and a camera have one or none."""
+    values = np.zeros((len(sightings.frames), len(sightings.cameras), *of_views.shape[1:]))
+    values[sightings.view_frame, sightings.view_camera] = of_views
+    return values
 
 
 def damped(H: Array, damping: float) -> Array:
@@ -286,7 +284,7 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
     other, and count less.
     """
     system = view_sums(sightings, poses, kappa, power=2)
-    H_cam, _, H_target, _, E = _blocks(sightings, system)
+    H_cam, _, H_target, _, E = blocks(sightings, system)
     S, Y = schur(H_cam, inverse_targets(H_target, gauge), E)
     free = np.repeat(~gauge.fixed_cameras, 6)
     P = np.zeros_like(S)
@@ -294,8 +292,7 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
         inverse = np.linalg.inv(S[np.ix_(free, free)])
         P[np.ix_(free, free)] = (inverse + inverse.T) / 2
     variance = residual_variance(system.squares, degrees_of_freedom(sightings, gauge), kappa)
-    W, _ = _by_frame(sightings, system)
-    _, g = _by_frame(sightings, view_sums(sightings, poses, kappa))
+    W, g = by_frame(sightings, system.W), by_frame(sightings, view_sums(sightings, poses, kappa).g)
     place, held = places(poses.T_world_target), bool(gauge.fixed_frames.any())
     variance *= repetition(W, g, E, Y, P, variance, place, frame_held=held)
     return variance * P, variance

@@ -115,19 +115,13 @@ def _errors(
     if shift is not None and shift.is_significant:
         named = {camera.name: float(px) for camera, px in zip(sightings.cameras, shift.shift_px)}
     left = settled.judged.adjustment.scale
+    noisier = float(np.median(settled.sightings.sigma_px / sightings.sigma_px))
     return CornerErrors(
         shift_px=named if applied else {},
         doubtful_shift_px={} if applied else named,
         noise_px=settled.noise_px,
-        beyond_promise=left * _noise_ratio(settled) if applied else max(scale, left),
+        beyond_promise=left * noisier if applied else max(scale, left),
     )
-
-
-def _noise_ratio(settled: _Settled) -> float:
-    """How many times larger the sigmas are than without the model noise."""
-    sigma = settled.sightings.sigma_px
-    own = np.sqrt(np.maximum(sigma**2 - settled.noise_px**2, 1e-12))
-    return float(np.median(sigma / own)) if len(sigma) else 1.0
 
 
 def _shift_covariance(settled: _Settled, shift: EdgeShift | None, applied: bool) -> Array:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aruco.pose_math import Array
-from rigcal.solve.adjust import KAPPA, Adjustment, Gauge, adjust, inverse_targets, schur
+from rigcal.solve.adjust import KAPPA, Adjustment, Gauge, adjust, blocks, by_frame, inverse_targets, schur
 from rigcal.solve.problem import Sightings, direction_sums, view_sums
 
 # The sRGB curve alone shifts an edge blurred by half a pixel by 0.4 px; sharpening and exposure take or add as much.
@@ -32,8 +32,6 @@ COMMON_PX = 0.4
 SPREAD_PX = 0.1
 MAX_ROUNDS = 8
 SETTLED_PX = 1e-3
-
-
 # A shift below this many standard deviations is none.
 SIGNIFICANT = 5.0
 # More than any curve and lens do to an edge that can be fitted: the markers are of another size.
@@ -117,7 +115,7 @@ def find_shift(sightings: Sightings, adjustment: Adjustment, gauge: Gauge) -> Ed
     """
     some, gauge = _fewer(sightings, gauge)
     direction = outwards(some)
-    shift, found = np.zeros(len(some.cameras)), replace(adjustment, scale=max(adjustment.scale, 1e-9))
+    shift, found = np.zeros(len(some.cameras)), adjustment
     system = _reduced(some, found, gauge, direction, shift)
     for _ in range(MAX_ROUNDS):
         step = -np.linalg.solve(system.information, system.gradient)
@@ -169,13 +167,10 @@ class _Reduced:
 def _reduced(sightings: Sightings, at: Adjustment, gauge: Gauge, direction: Array, shift: Array) -> _Reduced:
     kappa = KAPPA * at.scale
     sums, extra = view_sums(sightings, at.poses, kappa), direction_sums(sightings, at.poses, kappa, direction)
-    n_cam, n_frame = len(sightings.cameras), len(sightings.frames)
-    view = (sightings.view_frame, sightings.view_camera)
-    W, h = np.zeros((n_frame, n_cam, 6, 6)), np.zeros((n_frame, n_cam, 6))
-    W[view], h[view] = sums.W, extra.h
-    E = -W.reshape(n_frame, 6 * n_cam, 6)
-    inverse = inverse_targets(W.sum(axis=1), gauge)
-    S, Y = schur(W.sum(axis=0), inverse, E)
+    H_cam, _, H_target, _, E = blocks(sightings, sums)
+    inverse = inverse_targets(H_target, gauge)
+    S, Y = schur(H_cam, inverse, E)
+    h, n_cam = by_frame(sightings, extra.h), len(sightings.cameras)
     # The shift moves what is seen, r = predicted - seen + d s: coupled to targets by h, to cameras by -h.
     G_target = h.transpose(0, 2, 1)  # (f, 6, c)
     G_cam = np.zeros((n_cam, 6, n_cam))
