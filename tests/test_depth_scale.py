@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from target_views import sight
 
+from aruco.depth_patches import MARGIN_PX, MAX_FRAMES, patches, sample, spread_frames
 from aruco.marker_geometry import Face
 from aruco.model import SILENT, BadFrame, Camera, Detection, Frame, Recording
 from aruco.pose_math import Array, Pose, invert_transform, make_pose
@@ -19,17 +20,12 @@ from aruco.rig_estimate import Placement, RigEstimate
 from rigcal.config import CalibrateConfig, DetectConfig
 from rigcal.depth_scale import (
     CAMERA_SIGMA,
-    MARGIN_PX,
-    MAX_FRAMES,
     MAX_FRAMES_WITHOUT_DEPTH,
     CameraDepth,
     DepthScale,
     agreed,
     depth_scale,
-    patches,
-    sample,
     scale_from_depth,
-    spread_frames,
 )
 from rigcal.evidence import Evidence, look
 from rigcal.kept import NOTHING_KEPT
