@@ -1,0 +1,131 @@
+"""What one camera's depth saw of a resting scene, checked at birth.
+
+Owns      CameraDepth, and whether it fits together.
+Leaves    making one to depth_pool, keeping it to depth_save.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aruco.depth_image import check_depth, with_holes
+from aruco.depth_pool import KeptFrame, PooledDepth
+from aruco.errors import InputError
+from aruco.pose_math import Array
+
+# The principal point lies near the middle: where it is farther off (share of the image), intrinsics are those of
+# another resolution. Half and twice the resolution put it at a quarter and at the whole.
+MAX_OFF_CENTRE = 0.2
+_MAX_NAME = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraDepth:
+    """What one camera saw of the resting scene."""
+
+    depth: NDArray[np.float32]  # (H, W) metres along the optical axis, NaN = none
+    K: Array  # (3, 3) of the depth image
+    confidence: NDArray[np.uint8] | None = None  # (H, W) 0..100, lower is more trustworthy
+    spread: NDArray[np.float32] | None = None  # (H, W) robust standard deviation over time [m]
+    count: NDArray[np.uint16] | None = None  # (H, W) measurements pooled
+    n_frames: int = 1  # images pooled
+    baseline_m: float | None = None  # stereo cameras: distance of the two eyes
+    frames: Mapping[int, KeptFrame] = field(default_factory=dict)  # single images that were pooled, by stamp [ns]
+
+    def __post_init__(self) -> None:
+        """Check that everything has the size of the depth, and the intrinsics; InputError says what does not."""
+        if np.ndim(self.depth) != 2:
+            raise InputError(f"depth must be an image (H, W), got shape {np.shape(self.depth)}.")
+        object.__setattr__(self, "depth", np.asarray(self.depth, dtype=np.float32))
+        images = {"confidence": self.confidence, "spread": self.spread, "count": self.count}
+        images |= {f"frame {stamp}": frame.depth for stamp, frame in self.frames.items()}
+        for name, image in images.items():
+            if image is not None and np.shape(image) != self.depth.shape:
+                raise InputError(f"{name} of shape {np.shape(image)} beside depth of {self.depth.shape}.")
+        object.__setattr__(self, "K", _checked_intrinsics(self.K))
+        if self.n_frames < 1:
+            raise InputError(f"n_frames must be positive, got {self.n_frames}.")
+        if self.baseline_m is not None and not (math.isfinite(self.baseline_m) and self.baseline_m > 0):
+            raise InputError(f"baseline must be positive metres, got {self.baseline_m}.")
+
+    @property
+    def focal_baseline(self) -> float | None:
+        """Focal length times baseline [px m]; None where the baseline is not known."""
+        return None if self.baseline_m is None else float(self.K[0, 0]) * self.baseline_m
+
+    def as_camera_data(self) -> dict[str, Any]:
+        """The form in which ground_plane and icp_registration take it."""
+        return {
+            "depth": self.depth,
+            "K": self.K,
+            "confidence": self.confidence,
+            "spread": self.spread,
+            "count": self.count,
+            "baseline": self.baseline_m,
+            "n_frames": self.n_frames,
+        }
+
+
+def camera_depth(pooled: PooledDepth, *, K: Array, baseline_m: float | None = None) -> CameraDepth:
+    """Pooled depth with the intrinsics (3, 3) of its images; raises InputError where they are none."""
+    return CameraDepth(
+        depth=pooled.depth,
+        K=K,
+        confidence=pooled.confidence,
+        spread=pooled.spread,
+        count=pooled.count,
+        n_frames=pooled.n_frames,
+        baseline_m=baseline_m,
+        frames=pooled.frames,
+    )
+
+
+def check_name(name: str, where: str) -> str:
+    """A camera's name, if it can be that of a group in a store, of a folder and of an entry in an extrinsics file.
+
+    Raises:
+        InputError: It cannot.
+    """
+    usable = 0 < len(name) <= _MAX_NAME and name.isprintable() and not set(name) & set("/\\")
+    if not usable or name in {".", ".."} or name.startswith("_"):
+        raise InputError(
+            f"{where}: {name[:40]!r} cannot be a camera's name: it must not be empty, start with _ or hold slashes; "
+            "rename the camera."
+        )
+    return name
+
+
+def check_camera(camera: CameraDepth, where: str) -> None:
+    """Find out whether a camera's depth can be worked with.
+
+    Raises:
+        InputError: The depth is none (see depth_image.check_depth), or the intrinsics are those of another size.
+    """
+    check_depth(camera.depth, where)
+    for stamp, frame in camera.frames.items():
+        with_holes(frame.depth, f"{where}, frame {stamp}")
+    size = np.array(camera.depth.shape[::-1])
+    centre = camera.K[:2, 2]
+    if (np.abs((centre + 0.5) / size - 0.5) > MAX_OFF_CENTRE).any():
+        raise InputError(
+            f"{where}: intrinsics with the principal point at ({centre[0]:.0f}, {centre[1]:.0f}) do not fit depth of "
+            f"{size[0]} x {size[1]} pixels; give those of the depth image's resolution."
+        )
+
+
+def _checked_intrinsics(K: Any) -> Array:
+    matrix = np.array(K, dtype=np.float64)
+    if matrix.shape != (3, 3):
+        raise InputError(f"intrinsics must be a matrix (3, 3), got shape {matrix.shape}.")
+    if not np.isfinite(matrix).all():
+        raise InputError("intrinsics hold NaN or infinite numbers; give those of the depth image.")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[1, 0] != 0 or not np.allclose(matrix[2], [0, 0, 1]):
+        raise InputError("intrinsics are no camera matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx, fy.")
+    matrix.setflags(write=False)
+    return matrix
