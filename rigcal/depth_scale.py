@@ -1,7 +1,7 @@
 """The scale of the marker map beside the distances that depth cameras measure.
 
 Owns      one ratio of measured to predicted depth a camera, what cameras agree on.
-Leaves    sampling depth to aruco.depth_patches, limits to rigcal.quality.gates, the sentences to rigcal.verdict.
+Leaves    sampling depth to depth_samples, limits to rigcal.quality.gates, the sentences to rigcal.verdict.
 
 A map that is wrong by one factor everywhere puts cameras farther away by that factor, and no image shows it. Depth is
 the only witness. Every stereo camera has a scale error of its own (about one percent), so cameras are asked one by one
@@ -17,14 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from loguru import logger
 
-from aruco.depth_patches import patches, sample, spread_frames, typical_ratio
-from aruco.model import Camera, Detection, Frame, Recording
+from aruco.depth_patches import FaceDepth, typical_ratio
+from aruco.model import Camera, Detection, Recording
 from aruco.pose_math import Array, invert_transform
 from aruco.rig_estimate import RigEstimate
+from rigcal.depth_samples import faces_by_frame, frame_images
 from rigcal.evidence import Evidence
 
-# Images can be recorded more often than depth, but not many times more: then a camera has none.
-MAX_FRAMES_WITHOUT_DEPTH = 3
 MIN_SAMPLES = 5  # of all cameras together
 MIN_SAMPLES_OF_CAMERA = 2
 # Stereo bias of one camera: 0.3 percent, and 0.15 to 0.3 px of disparity, which at 2 to 3 m is about one percent.
@@ -56,11 +55,7 @@ def scale_from_depth(evidence: Evidence, rig: RigEstimate) -> DepthScale | None:
     """The scale of a finished rig; see depth_scale. Stretches of rest are no frames, so they tell nothing."""
     if evidence.config.still:
         return None
-    moments = evidence.moments
-    images = {
-        name: {frame: int(index) for frame, index in enumerate(moments.groups[:, c]) if index >= 0}
-        for c, name in enumerate(moments.sync.cameras)
-    }
+    images = frame_images(evidence)
     return depth_scale(evidence.recording, rig, evidence.detections, images, evidence.target.geometry)
 
 
@@ -86,7 +81,10 @@ def depth_scale(
     cameras: dict[str, CameraDepth] = {}
     for camera in recording.cameras:
         if camera.name in rig.cameras:
-            ratios = _ratios(recording, camera, rig, detections[camera.name], images.get(camera.name, {}), geometry)
+            seen, indices = detections[camera.name], images.get(camera.name, {})
+            faces = faces_by_frame(recording, camera, rig, seen, indices, geometry)
+            found = np.array([_ratio(face, camera, rig) for face in faces])
+            ratios = found[np.isfinite(found)]
             if len(ratios) >= MIN_SAMPLES_OF_CAMERA:
                 ratio = float(np.median(ratios))
                 spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
@@ -117,33 +115,8 @@ def agreed(cameras: Mapping[str, CameraDepth]) -> DepthScale:
     )
 
 
-def _ratios(
-    recording: Recording,
-    camera: Camera,
-    rig: RigEstimate,
-    detections: Mapping[int, Detection],
-    images: Mapping[int, int],
-    geometry: Mapping[int, Array],
-) -> Array:
-    """Measured over predicted depth of every marker in the chosen frames, one frame in memory at a time."""
-    used = rig.cameras[camera.name]
-    frames = [f for f in used.frames if f in detections and f in images and f in rig.T_world_target]
-    chosen = {images[f]: f for f in spread_frames({f: len(detections[f]) for f in frames})}
-    T_cam_world = invert_transform(used.T_world_cam)
+def _ratio(face: FaceDepth, camera: Camera, rig: RigEstimate) -> float:
+    """Measured over predicted depth of one marker in one frame; NaN where its pixels show several surfaces."""
     K = camera.K if camera.depth_K is None else camera.depth_K
-    ratios: list[float] = []
-    without = 0
-    order = sorted(chosen)
-    for index, frame in zip(order, recording.frames(camera.name, order, depth=True)):
-        if not isinstance(frame, Frame):
-            continue
-        if frame.depth_m is None:
-            without += 1
-            if without >= MAX_FRAMES_WITHOUT_DEPTH and not ratios:
-                break
-            continue
-        f = chosen[index]
-        for patch in patches(camera, detections[f], T_cam_world @ rig.T_world_target[f], geometry):
-            ratios.append(typical_ratio(*sample(patch, K, np.asarray(frame.depth_m))))
-    found = np.array(ratios, dtype=np.float64)
-    return found[np.isfinite(found)]
+    T_cam_target = invert_transform(rig.cameras[camera.name].T_world_cam) @ rig.T_world_target[face.frame]
+    return typical_ratio(face.measured_m, face.predicted_m(T_cam_target, K))

@@ -12,15 +12,15 @@ import pytest
 from numpy.typing import NDArray
 from target_views import sight
 
-from aruco.depth_patches import MARGIN_PX, MAX_FRAMES, patches, sample, spread_frames
+from aruco.depth_patches import MAX_FRAMES, spread_frames
 from aruco.marker_geometry import Face
 from aruco.model import SILENT, BadFrame, Camera, Detection, Frame, Recording
 from aruco.pose_math import Array, Pose, invert_transform, make_pose
 from aruco.rig_estimate import Placement, RigEstimate
 from rigcal.config import CalibrateConfig, DetectConfig
+from rigcal.depth_samples import MAX_FRAMES_WITHOUT_DEPTH
 from rigcal.depth_scale import (
     CAMERA_SIGMA,
-    MAX_FRAMES_WITHOUT_DEPTH,
     CameraDepth,
     DepthScale,
     agreed,
@@ -282,27 +282,6 @@ def test_few_frames_are_read_those_with_most_markers() -> None:
     assert {30, 90, 198} <= set(chosen)
     assert spread_frames({7: 2, 3: 1}) == [3, 7]
     assert spread_frames({}) == []
-
-
-def test_samples_lie_well_inside_and_are_predicted_pixel_by_pixel() -> None:
-    K = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
-    camera = Camera(name="a", width=640, height=480, K=K)
-    # A square of 0.4 m at 2 m, tilted by 45 degrees: from 1.86 to 2.14 m.
-    tilt = np.array([[1.0, 0, 0], [0, np.sqrt(0.5), -np.sqrt(0.5)], [0, np.sqrt(0.5), np.sqrt(0.5)]])
-    quad = {0: 0.2 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])}
-    T = make_pose(tilt, np.array([0.0, 0, 2.0]))
-    seen = sight(camera, T, quad, 0.0, np.random.default_rng(0))
-    (patch,) = patches(camera, seen, T, quad)
-    rows, columns = np.mgrid[:480, :640]
-    # y = z - 2 on the plane and y = z (v - cy) / f in the image: z = 2 / (1 - (v - cy) / f).
-    plane = 2.0 / (1.0 - (rows - 240) / 400.0)
-    measured, predicted = sample(patch, K, plane)
-    np.testing.assert_allclose(measured, predicted, rtol=1e-6)
-    assert np.ptp(predicted) > 0.2
-    depth = np.where((rows + columns) >= 0, np.nan, plane)
-    x0, y0 = np.floor(seen.corners_px[0].min(axis=0) + MARGIN_PX).astype(int)
-    depth[:y0], depth[:, :x0] = 1.0, 1.0  # everything above and left of what may be looked at
-    assert len(sample(patch, K, depth)[0]) == 0
 
 
 # --- what cameras agree on ------------------------------------------------------------------------------------------
