@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from rigcal.depth_options import check_depth_options, depth_options
+
 if TYPE_CHECKING:
-    from aruco.marker_geometry import Face
     from aruco.model import Calibration
 
 DOUBTFUL = 3  # exit code: poses were written, but not of every camera, or they are called bad
@@ -62,6 +62,7 @@ DOUBTFUL = 3  # exit code: poses were written, but not of every camera, or they 
 @click.option("--refine-target", is_flag=True,
               help="The marker map is only roughly right: estimate where the markers are on the target too. Each keeps "
                    "its size, which fixes the scale; the corrected map is written beside the output.")  # fmt: skip
+@depth_options
 @click.option("--preview/--no-preview", default=False, show_default=True,
               help="Write annotated frames into a folder beside the output.")  # fmt: skip
 @click.option("--seed", type=int, default=0, show_default=True, help="For every random choice.")
@@ -85,30 +86,22 @@ def main(**given: Any) -> None:
     if given["refine_target"] and (given["board"] or not given["joint"]):
         raise click.UsageError("--refine-target estimates a marker map in the joint adjustment: it wants --markers, "
                                "and neither --board nor --no-joint")  # fmt: skip
+    check_depth_options(given)
     if not given["auto_align"] and (given["ground_face"] or given["ground_marker_id"] or given["up_axis"] != "+y"):
         click.echo("warning: --ground-face, --ground-marker-id and --up-axis do nothing without --auto-align", err=True)
     from rigcal import cli
 
     with cli.telling_errors(debug=given["debug"]):
         calibration = _run(given)
-        cli.tell(calibration, given["output"])
         raise SystemExit(0 if calibration.is_whole and not calibration.is_bad else DOUBTFUL)
 
 
 def _run(given: dict[str, Any]) -> Calibration:
-    from aruco.atomic import check_writable
-    from aruco.marker_geometry import save_faces
     from rigcal import cli
-    from rigcal.formats import native
+    from rigcal.calibrate_outputs import CalibrateOutputs
     from rigcal.pipeline import calibrate_files
 
-    cli.refuse_inputs(given["output"], [*given["svo"], *given["inputs"]], given["markers"], given["fix"])
-    corrected_map = cli.beside(given["output"], "_markers.parquet")
-    check_writable(given["output"])
-    if given["refine_target"]:
-        cli.refuse_inputs(corrected_map, [], given["markers"])
-        check_writable(corrected_map)
-    faces: list[Sequence[Face]] = []
+    outputs = CalibrateOutputs.asked_for(given)
     with cli.showing_progress() as progress:
         calibration = calibrate_files(
             [*given["svo"], *given["inputs"]],
@@ -119,11 +112,10 @@ def _run(given: dict[str, Any]) -> Calibration:
             jobs=given["jobs"],
             progress=progress,
             preview=cli.beside(given["output"], "_preview") if given["preview"] else None,
-            on_target=faces.append,
+            listeners=outputs.listeners,
         )
-    if faces:
-        save_faces(corrected_map, faces[0])
-    native.write_extrinsics(given["output"], calibration)
+    outputs.write(calibration)
+    outputs.tell(calibration)
     return calibration
 
 

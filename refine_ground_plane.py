@@ -1,18 +1,95 @@
 #!/usr/bin/env python
-"""Level the world on the real floor."""
+"""Poses and the rig's own depth in, the same rig on its real floor out: ask, call rigcal.levelling, tell."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
 import click
 
+if TYPE_CHECKING:
+    from rigcal.levelled_rig import Levelling
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+PARTIAL = 3  # exit code: written, but not every camera was levelled on a floor that it sees itself
+
+
+@click.command(context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
+@click.option("-i", "--input-extrinsics", type=click.Path(path_type=Path), required=True, metavar="FILE",
+              help="Poses of an upright world: what calibrate-extrinsics --auto-align has written.")  # fmt: skip
+@click.option("-d", "--input-depth", type=click.Path(path_type=Path), required=True, metavar="FILE.h5",
+              help="Depth of the same cameras: what calibrate-extrinsics --save-depth has written.")  # fmt: skip
+@click.option("-o", "--output-extrinsics", type=click.Path(path_type=Path), required=True, metavar="FILE",
+              help="Where the levelled poses go; never one of the inputs.")  # fmt: skip
+@click.option("--metrics-json", type=click.Path(path_type=Path), metavar="FILE",
+              help="Write what was found of the floor into a file of its own too.")  # fmt: skip
+@click.option("--plot/--no-plot", default=None,
+              help="Write a page that shows the floor before and after, in 3D and as height maps. "
+                   "Default: only if --plot-output is given.")  # fmt: skip
+@click.option("--plot-output", type=click.Path(path_type=Path), metavar="FILE.html",
+              help="Where the page goes. Default: beside the output, named after it.")  # fmt: skip
+@click.option("--max-rotation-deg", type=float, default=5.0, show_default=True, metavar="DEG",
+              help="How far one camera may be turned against the others; more is refused.")  # fmt: skip
+@click.option("--max-translation-m", type=float, default=0.1, show_default=True, metavar="M",
+              help="How far one camera may be raised or lowered against the others.")  # fmt: skip
+@click.option("--ransac-threshold", type=float, metavar="M",
+              help="How near a plane depth must be to be part of it. Default: by the noise of depth.")  # fmt: skip
+@click.option("--height-range", type=float, nargs=2, metavar="MIN MAX",
+              help="Look for the floor only between these heights of the input's world [m].")  # fmt: skip
+@click.option("--stride", type=click.IntRange(min=1), default=4, show_default=True, metavar="N",
+              help="Use every Nth row and column of the depth.")  # fmt: skip
+@click.option("--target-floor-y", type=float, default=0.0, show_default=True, metavar="M",
+              help="Where the floor is put on the y axis.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="For every random choice.")
+@click.option("--debug", is_flag=True, help="Say more about what happens.")
 @click.version_option(package_name="rigcal")
-def main() -> None:
-    """Level a calibration on the real floor, seen by the rig's own depth (not in this version yet)."""
-    raise click.ClickException(
-        "this version cannot level on the floor yet; calibrate-extrinsics --auto-align turns the world upright."
+def main(**given: Any) -> None:
+    """Level a calibration on the real floor, seen by the rig's own depth.
+
+    The whole rig is turned and shifted onto the floor that its cameras agree on; then each camera's pitch, roll and
+    height are corrected as far as the floor knows them better than its pose. Yaw, x and z stay.
+
+    Exit codes: 0 all cameras levelled, 1 an error, 2 wrong usage, 3 written, but some camera sees no floor, or one that
+    contradicts the others'.
+    """
+    if given["plot"] is False and given["plot_output"]:
+        raise click.UsageError("--plot-output names a page that --no-plot forbids: give one of them")
+    from rigcal import cli
+
+    with cli.telling_errors(debug=given["debug"]):
+        levelling = _run(given)
+        raise SystemExit(0 if levelling.is_whole else PARTIAL)
+
+
+def _run(given: dict[str, Any]) -> Levelling:
+    from aruco.ground_plane import GroundPlaneConfig
+    from rigcal.levelling import level_files
+    from rigcal.levelling_outputs import LevellingOutputs
+
+    config = GroundPlaneConfig(
+        max_rotation_deg=given["max_rotation_deg"],
+        max_translation_m=given["max_translation_m"],
+        ransac_threshold_m=given["ransac_threshold"],
+        height_range=given["height_range"],
+        stride=given["stride"],
+        target_floor_y=given["target_floor_y"],
+        seed=given["seed"],
     )
+    outputs = LevellingOutputs.asked_for(given)
+    levelling = level_files(given["input_extrinsics"], given["input_depth"], config)
+    outputs.write(levelling)
+    _tell(levelling, outputs.paths)
+    return levelling
+
+
+def _tell(levelling: Levelling, written: list[Path]) -> None:
+    from rigcal.report.floor_table import show_levelling
+    from rigcal.report.terminal import console
+
+    out = console()
+    show_levelling(out, levelling.figures, levelling.facts)
+    for path in written:
+        out.print(f"Wrote {path}", markup=False)
 
 
 if __name__ == "__main__":

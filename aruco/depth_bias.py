@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -37,14 +37,17 @@ class DepthBias:
     inverse_depth: float = 0.0  # d / (f B) [1/m]; of the stereo model
     offset_m: float = 0.0  # of the offset model
     focal_baseline: float | None = None  # f B [px m], where it is known
+    covariance: Array | None = field(default=None, compare=False)  # (2, 2) of scale and inverse_depth or offset_m
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are no bias."""
+        """Refuse numbers that are no bias, and freeze."""
         numbers = (self.scale, self.inverse_depth, self.offset_m)
         if not all(map(math.isfinite, numbers)) or abs(self.scale) > MAX_SCALE:
             raise InputError(f"depth bias {numbers}: want finite numbers, and a scale within {MAX_SCALE:g} of none.")
         if self.focal_baseline is not None and not (math.isfinite(self.focal_baseline) and self.focal_baseline > 0):
             raise InputError(f"depth bias: focal_baseline must be positive pixel metres, got {self.focal_baseline}.")
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", _checked_covariance(self.covariance))
 
     @property
     def disparity_px(self) -> float | None:
@@ -71,10 +74,44 @@ class DepthBias:
     def as_dict(self) -> dict[str, float]:
         """The layout of ``_meta.depth_bias``."""
         if self.model == "offset":
-            return {"scale": self.scale, "offset_m": self.offset_m}
+            return {"scale": self.scale, "offset_m": self.offset_m, **self._doubt("offset_m")}
         if self.focal_baseline is None or self.disparity_px is None:
-            return {"scale": self.scale, "inverse_depth": self.inverse_depth}
-        return {"scale": self.scale, "disparity_px": self.disparity_px, "focal_baseline": self.focal_baseline}
+            return {"scale": self.scale, "inverse_depth": self.inverse_depth, **self._doubt("inverse_depth")}
+        return {
+            "scale": self.scale,
+            "disparity_px": self.disparity_px,
+            "focal_baseline": self.focal_baseline,
+            **self._doubt("disparity_px", self.focal_baseline),
+        }
+
+    def sigma_m(self, depth_m: Array) -> Array:
+        """What is still unknown of corrected depth [m] at measured depth (n,); zero without a covariance."""
+        J = self.derivative(depth_m)
+        S = np.zeros((2, 2)) if self.covariance is None else self.covariance
+        return np.sqrt(np.maximum(np.einsum("in,ij,jn->n", J, S, J), 0.0))
+
+    def _doubt(self, second: str, unit: float = 1.0) -> dict[str, float]:
+        """The covariance as plain numbers; the second parameter is written in ``unit`` times its own unit."""
+        if self.covariance is None:
+            return {}
+        sigma = np.sqrt(np.diag(self.covariance))
+        product = float(sigma[0] * sigma[1])
+        return {
+            "sigma_scale": float(sigma[0]),
+            f"sigma_{second}": float(sigma[1]) * unit,
+            "correlation": float(self.covariance[0, 1]) / product if product > 0 else 0.0,
+        }
+
+
+def _checked_covariance(given: Any) -> Array:
+    S = np.array(given, dtype=np.float64)
+    # A correlation may be one, and rounding may put it a little beyond.
+    if S.shape != (2, 2) or not np.isfinite(S).all() or (np.diag(S) < 0).any() or not np.allclose(S, S.T):
+        raise InputError("depth bias: its covariance is not a symmetric 2x2 matrix with variances on its diagonal.")
+    if abs(S[0, 1]) > math.sqrt(S[0, 0] * S[1, 1]) * (1 + 1e-6):
+        raise InputError("depth bias: its correlation is beyond one.")
+    S.setflags(write=False)
+    return S
 
 
 def bias_from_dict(entry: Any, where: str) -> DepthBias:
@@ -90,13 +127,29 @@ def bias_from_dict(entry: Any, where: str) -> DepthBias:
     given: dict[str, float] = {str(name): float(x) for name, x in entry.items()}
     scale = given.get("scale", 0.0)
     if "offset_m" in given:
-        return DepthBias(model="offset", scale=scale, offset_m=given["offset_m"])
+        covariance = _covariance_of(given, "offset_m")
+        return DepthBias(model="offset", scale=scale, offset_m=given["offset_m"], covariance=covariance)
     if "inverse_depth" in given:
-        return DepthBias(scale=scale, inverse_depth=given["inverse_depth"])
+        covariance = _covariance_of(given, "inverse_depth")
+        return DepthBias(scale=scale, inverse_depth=given["inverse_depth"], covariance=covariance)
     if "disparity_px" in given and given.get("focal_baseline", 0.0) > 0:
         fB = given["focal_baseline"]
-        return DepthBias(scale=scale, inverse_depth=given["disparity_px"] / fB, focal_baseline=fB)
+        covariance = _covariance_of(given, "disparity_px", fB)
+        return DepthBias(
+            scale=scale, inverse_depth=given["disparity_px"] / fB, focal_baseline=fB, covariance=covariance
+        )
     raise InputError(
         f"{where}: the depth bias wants scale with disparity_px and focal_baseline, inverse_depth, or offset_m; run "
         "--refine-depth again."
     )
+
+
+def _covariance_of(given: Mapping[str, float], second: str, unit: float = 1.0) -> Array | None:
+    """(2, 2) from the plain numbers of an entry; None where it does not say how well it knows."""
+    if "sigma_scale" not in given or f"sigma_{second}" not in given:
+        return None
+    sigma = np.array([given["sigma_scale"], given[f"sigma_{second}"] / unit])
+    covariance = np.outer(sigma, sigma)
+    covariance[0, 1] *= given.get("correlation", 0.0)
+    covariance[1, 0] = covariance[0, 1]
+    return covariance

@@ -14,7 +14,7 @@ from loguru import logger
 
 from aruco.errors import OutputError, RigError
 from aruco.model import Calibration
-from rigcal.config import AlignConfig, CalibrateConfig, DetectConfig, FrameConfig
+from rigcal.config import AlignConfig, CalibrateConfig, DepthConfig, DetectConfig, FrameConfig
 from rigcal.report.progress import showing_progress
 from rigcal.report.terminal import console, show_calibration
 
@@ -52,6 +52,13 @@ def calibrate_config(given: Mapping[str, Any]) -> CalibrateConfig:
             ground_face=given["ground_face"],
             ground_marker_id=given["ground_marker_id"],
             up_axis=given["up_axis"],
+        ),
+        depth=DepthConfig(
+            save=given["save_depth"] is not None,
+            verify=given["verify_depth"],
+            refine=given["refine_depth"],
+            model=given["depth_model"],
+            baseline_m=given["baseline"],
         ),
         moving_target=given["moving_target"],
         still=given["still"],

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from aruco.errors import InputError
 from aruco.model import UpAxis
 
+MAX_BASELINE_M = 2.0  # no depth camera is wider; a number above it is in other units
 MAX_TOLERANCE_MS = 3_600_000.0  # frames an hour apart are no moment
 
 
@@ -50,12 +51,40 @@ class AlignConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DepthConfig:
+    """What the rig's own depth is asked."""
+
+    save: bool = False  # pool it over time and hand it out
+    verify: bool = False  # compare it with the target
+    refine: bool = False  # let it correct poses, and estimate its own bias
+    model: Literal["stereo", "offset"] = "stereo"  # of its bias
+    baseline_m: float | None = None  # of stereo cameras whose recording does not say
+    max_rotation_deg: float = 5.0  # a camera that depth would move farther stays
+    max_translation_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse a correction of what was not looked at, and baselines that are none."""
+        if self.refine and not self.verify:
+            raise InputError("--refine-depth corrects what --verify-depth has looked at: give both.")
+        if self.baseline_m is not None and not 0 < self.baseline_m <= MAX_BASELINE_M:
+            raise InputError(
+                f"--baseline {self.baseline_m:g}: want the distance of a camera's two eyes in metres, 0.12 for a ZED 2."
+            )
+
+    @property
+    def needed(self) -> bool:
+        """Whether any depth has to be read for it."""
+        return self.save or self.verify
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrateConfig:
     """Everything that changes the result of a calibration; how it is computed stands beside it in Resources."""
 
     frames: FrameConfig = field(default_factory=FrameConfig)
     detect: DetectConfig = field(default_factory=DetectConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
+    depth: DepthConfig = field(default_factory=DepthConfig)
     moving_target: bool = False
     still: bool = False  # use the stretches in which the target rests instead of single frames
     joint: bool = True  # adjust all cameras and frames together after the average

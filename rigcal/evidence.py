@@ -7,7 +7,8 @@ Leaves    what it means to pipeline.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from aruco.errors import CalibrationError
 from aruco.model import Camera, Detection, Progress, Recording
@@ -19,6 +20,9 @@ from rigcal.detecting import OnFrame, Seen, watch
 from rigcal.frames import Moments, each_alone, synchronised
 from rigcal.target import Target
 
+if TYPE_CHECKING:
+    from aruco.depth_save import CameraDepth
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Evidence:
@@ -29,6 +33,7 @@ class Evidence:
     config: CalibrateConfig
     moments: Moments
     seen: Mapping[str, Seen]
+    pooled: Mapping[str, CameraDepth] = field(default_factory=dict)  # camera -> its depth over time, if it was read
 
     @property
     def cameras(self) -> tuple[Camera, ...]:

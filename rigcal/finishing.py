@@ -25,10 +25,12 @@ from aruco.uncertainty import camera_sigma, carried, least_known
 from rigcal import diagnosis, notes
 from rigcal.config import AlignConfig
 from rigcal.depth_scale import scale_from_depth
+from rigcal.depth_witness import DepthTestimony, hear_depth
 from rigcal.detecting import Seen
 from rigcal.evidence import Evidence
 from rigcal.kept import KeptRig
 from rigcal.kept_check import NOTHING_COMPARED, KeptCheck
+from rigcal.listeners import NOBODY, Listeners
 from rigcal.placing import adjust_placed
 from rigcal.quality.gates import Quality
 from rigcal.solve.joint import JointRig
@@ -45,7 +47,13 @@ class _Solved:
     residuals: Mapping[str, Reprojection]  # also of cameras that were refused for them
 
 
-def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig, check: KeptCheck = NOTHING_COMPARED) -> Calibration:
+def finish(
+    average: RigEstimate,
+    evidence: Evidence,
+    kept: KeptRig,
+    check: KeptCheck = NOTHING_COMPARED,
+    listeners: Listeners = NOBODY,
+) -> Calibration:
     """One connected part of the rig: adjusted, checked, turned upright if that is wished.
 
     Args:
@@ -53,13 +61,18 @@ def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig, check: KeptC
         evidence: What was seen.
         kept: Cameras that stay, if the part is in their world.
         check: What was found out about them.
+        listeners: Are told how depth agrees with it.
 
     Raises:
         CalibrationError: The views contradict each other, no kept camera fits, or up is ambiguous.
     """
     config, faces = evidence.config, evidence.target.faces
     solved = _solve(average, evidence, kept)
+    depth = hear_depth(average, solved.rig, solved.joint, evidence, kept)
+    listeners.agreement(depth.agreement, depth.corrected)
+    solved = _corrected(solved, depth, evidence)
     T_aligned_world, about = align(solved.rig, faces, config.align, moving=config.target_moves)
+    about.update(depth.notes)
     rig = solved.rig.turned(T_aligned_world[:3, :3])
     if solved.joint is not None:
         about["adjusted"] = notes.adjustment(solved.joint)
@@ -82,12 +95,10 @@ def finish(average: RigEstimate, evidence: Evidence, kept: KeptRig, check: KeptC
 
 
 def _solve(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> _Solved:
-    config, geometry, fixed = evidence.config, evidence.target.geometry, kept.T_world_cam.keys()
+    config, fixed = evidence.config, kept.T_world_cam.keys()
     joint = adjust_placed(average, evidence, kept) if config.joint else None
     rig = average if joint is None else joint.rig
-    seen = evidence.detections if joint is None else joint.corners.taken_out_of(evidence.detections)
-    used = {name: {f: seen[name][f] for f in p.frames} for name, p in rig.cameras.items()}
-    residuals = reproject({camera.name: camera for camera in evidence.cameras}, rig, used, geometry)
+    residuals = _reprojected(rig, joint, evidence)
     rig = diagnosis.refuse_misfits(rig, residuals, evidence)
     if fixed and not fixed & rig.cameras.keys():
         reasons = "; ".join(f"camera {name}: {rig.lost[name]}" for name in sorted(fixed & rig.lost.keys()))
@@ -95,6 +106,22 @@ def _solve(average: RigEstimate, evidence: Evidence, kept: KeptRig) -> _Solved:
             f"No camera of {kept.file} fits where that puts it, so nothing ties the others to its world. {reasons}."
         )
     return _Solved(rig=rig, joint=joint, residuals=residuals)
+
+
+def _reprojected(rig: RigEstimate, joint: JointRig | None, evidence: Evidence) -> dict[str, Reprojection]:
+    """How far each camera's corners are from where the rig puts them."""
+    seen = evidence.detections if joint is None else joint.corners.taken_out_of(evidence.detections)
+    used = {name: {f: seen[name][f] for f in p.frames} for name, p in rig.cameras.items()}
+    return reproject({camera.name: camera for camera in evidence.cameras}, rig, used, evidence.target.geometry)
+
+
+def _corrected(solved: _Solved, depth: DepthTestimony, evidence: Evidence) -> _Solved:
+    """The part as depth has corrected it, or as it was."""
+    if depth.rig is solved.rig or solved.joint is None:
+        return solved
+    joint = replace(solved.joint, covariance={**solved.joint.covariance, **depth.covariance})
+    residuals = {**solved.residuals, **_reprojected(depth.rig, joint, evidence)}
+    return _Solved(rig=depth.rig, joint=joint, residuals=residuals)
 
 
 def _no_longer_fitting(average: RigEstimate, rig: RigEstimate, kept: KeptRig) -> dict[str, str]:

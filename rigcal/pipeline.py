@@ -6,7 +6,7 @@ Leaves    every step to the tools in aruco and the rooms of rigcal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,25 +15,22 @@ from loguru import logger
 
 from aruco import alignment
 from aruco.errors import CalibrationError, InputError
-from aruco.marker_geometry import Face
 from aruco.model import SILENT, Calibration, Progress, Recording
 from aruco.rig_estimate import RigEstimate
 from rigcal import diagnosis, notes
 from rigcal.config import CalibrateConfig, Resources
-from rigcal.detecting import OnFrame
+from rigcal.depth_pooling import pool_recording, require_depth
 from rigcal.evidence import Evidence, at_rest, look
 from rigcal.finishing import finish
 from rigcal.kept import NOTHING_KEPT, KeptRig, kept_from_file
 from rigcal.kept_check import NOTHING_COMPARED, KeptCheck, compare_kept
+from rigcal.listeners import NOBODY, Listeners
 from rigcal.placing import place_with_target
 from rigcal.preview_writer import PreviewWriter
 from rigcal.solve.graph import GraphHealth, graph_health
 from rigcal.solve.target_shape import RefinedTarget
 from rigcal.sources import open_recordings
 from rigcal.target import Target, board_target, marker_target_from_file
-
-# Called with the faces of a target whose map was corrected.
-OnTarget = Callable[[Sequence[Face]], object]
 
 
 def calibrate(
@@ -44,8 +41,7 @@ def calibrate(
     kept: KeptRig = NOTHING_KEPT,
     resources: Resources | None = None,
     progress: Progress = SILENT,
-    on_frame: OnFrame | None = None,
-    on_target: OnTarget = lambda faces: None,
+    listeners: Listeners = NOBODY,
 ) -> Calibration:
     """Every camera's pose in the target's world.
 
@@ -56,21 +52,26 @@ def calibrate(
         kept: Cameras that stay where an earlier calibration put them; their world is that of the result.
         resources: What changes only time and memory.
         progress: Is told how far the long steps have come.
-        on_frame: Is called with every image that was read, from several threads.
-        on_target: Is called with the target's corrected faces, if they were estimated.
+        listeners: Are told what was found beside the poses.
 
     Raises:
         InputError: The recording or an option cannot be used.
         CalibrationError: No camera could be placed, or up is ambiguous.
     """
     jobs = (resources or Resources()).jobs
-    evidence = look(recording, target, config, jobs=jobs, progress=progress, on_frame=on_frame)
+    if config.depth.needed:
+        require_depth(recording)
+    evidence = look(recording, target, config, jobs=jobs, progress=progress, on_frame=listeners.frame)
     diagnosis.require_views(recording, target, config.detect, evidence.seen)
-    return calibrate_seen(at_rest(evidence) if config.still else evidence, kept=kept, on_target=on_target)
+    if config.depth.needed:
+        pooled = pool_recording(recording, config.depth.baseline_m, jobs=jobs, progress=progress)
+        listeners.depth(pooled)
+        evidence = replace(evidence, pooled=pooled)
+    return calibrate_seen(at_rest(evidence) if config.still else evidence, kept=kept, listeners=listeners)
 
 
 def calibrate_seen(
-    evidence: Evidence, *, kept: KeptRig = NOTHING_KEPT, on_target: OnTarget = lambda faces: None
+    evidence: Evidence, *, kept: KeptRig = NOTHING_KEPT, listeners: Listeners = NOBODY
 ) -> Calibration:
     """The same, from what the cameras saw; see calibrate for arguments and errors."""
     if kept.T_world_cam and evidence.config.align.enabled:
@@ -83,10 +84,10 @@ def calibrate_seen(
     refined: dict[str, Any] = {}
     if found is not None:
         refined = {"target_refined": _noted(found, rough)}
-        on_target(evidence.target.faces)
+        listeners.target(evidence.target.faces)
     unseen = diagnosis.cameras_without_views(evidence.recording, evidence.moments.sync, evidence.seen)
     first = replace(first, lost={**unseen, **first.lost})
-    calibration = _first_part(first, evidence, held, check)
+    calibration = _first_part(first, evidence, held, check, listeners)
     about = {
         "frames": notes.frame_counts(evidence.seen),
         "sync": notes.clock(evidence.moments),
@@ -99,7 +100,7 @@ def calibrate_seen(
         calibration,
         frames={name: s.counts for name, s in evidence.seen.items()},
         notes={**calibration.notes, **about},
-        parts=tuple(part for rig in others if (part := _other_part(rig, evidence)) is not None),
+        parts=tuple(part for rig in others if (part := _other_part(rig, evidence, listeners)) is not None),
     )
     return _put_back(calibration, kept, check)
 
@@ -114,7 +115,7 @@ def calibrate_files(
     jobs: int | None = None,
     progress: Progress = SILENT,
     preview: Path | None = None,
-    on_target: OnTarget = lambda faces: None,
+    listeners: Listeners = NOBODY,
 ) -> Calibration:
     """The same, from files: recordings, a marker map or a board, and a folder for previews if they are wished."""
     if board is None:
@@ -126,7 +127,8 @@ def calibrate_files(
         alignment.specified_face(target.faces, config.align.ground_face, config.align.ground_marker_id)
     kept = NOTHING_KEPT if fix is None else kept_from_file(fix)
     recording = open_recordings(paths)
-    on_frame = None if preview is None else PreviewWriter(preview, target.geometry)
+    if preview is not None:
+        listeners = replace(listeners, frame=PreviewWriter(preview, target.geometry))
     resources = Resources() if jobs is None else Resources(jobs=jobs)
     return calibrate(
         recording,
@@ -135,8 +137,7 @@ def calibrate_files(
         kept=kept,
         resources=resources,
         progress=progress,
-        on_frame=on_frame,
-        on_target=on_target,
+        listeners=listeners,
     )
 
 
@@ -169,20 +170,22 @@ def _noted(found: RefinedTarget, target: Target) -> dict[str, Any]:
     return note
 
 
-def _first_part(rig: RigEstimate, evidence: Evidence, held: KeptRig, check: KeptCheck) -> Calibration:
+def _first_part(
+    rig: RigEstimate, evidence: Evidence, held: KeptRig, check: KeptCheck, listeners: Listeners
+) -> Calibration:
     """The part in the world of the kept cameras, if there are any."""
     try:
-        return finish(rig, evidence, held, check)
+        return finish(rig, evidence, held, check, listeners)
     except CalibrationError as error:
         if not check.contradictions:
             raise
         raise CalibrationError(" ".join([*(c.sentence for c in check.contradictions), str(error)])) from error
 
 
-def _other_part(rig: RigEstimate, evidence: Evidence) -> Calibration | None:
+def _other_part(rig: RigEstimate, evidence: Evidence, listeners: Listeners) -> Calibration | None:
     """A part that nothing connects with the first, in a world of its own; its failure costs the first nothing."""
     try:
-        return finish(rig, evidence, NOTHING_KEPT)
+        return finish(rig, evidence, NOTHING_KEPT, listeners=listeners)
     except CalibrationError as error:
         logger.warning("cameras {} could not be placed on their own: {}", ", ".join(rig.cameras), error)
         return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,3 +83,36 @@ def test_other_entries_are_refused_with_a_sentence(entry: object) -> None:
 def test_numbers_that_are_no_bias_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError):
         DepthBias(**wrong)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    "bias",
+    [
+        DepthBias(scale=0.004, inverse_depth=0.0015, focal_baseline=FOCAL_BASELINE),
+        DepthBias(scale=0.004, inverse_depth=0.0015),
+        DepthBias(model="offset", scale=-0.001, offset_m=0.012),
+    ],
+)
+@pytest.mark.parametrize("correlation", [-0.9, 0.0, 1.0])
+def test_the_file_keeps_how_well_it_is_known(bias: DepthBias, correlation: float) -> None:
+    sigma = np.array([2e-3, 7e-4])
+    S = np.outer(sigma, sigma) * [[1.0, correlation], [correlation, 1.0]]
+    known = replace(bias, covariance=S)
+    entry = known.as_dict()
+    assert entry["sigma_scale"] == pytest.approx(2e-3)
+    back = bias_from_dict(entry, "a.json: camera c")
+    assert back.covariance is not None
+    np.testing.assert_allclose(back.covariance, S, rtol=1e-9, atol=1e-15)
+    # What is left to doubt in a depth is the plain propagation through the derivative.
+    z = np.array([1.0, 4.0])
+    J = known.derivative(z)
+    np.testing.assert_allclose(back.sigma_m(z), [np.sqrt(max(j @ S @ j, 0.0)) for j in J.T], rtol=1e-6, atol=1e-9)
+    assert bias.sigma_m(z).max() == 0.0
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.eye(3), [[1.0, 0.5], [0.4, 1.0]], [[-1.0, 0.0], [0.0, 1.0]], [[1.0, 2.0], [2.0, 1.0]]]
+)
+def test_a_covariance_that_is_none_is_refused(wrong: object) -> None:
+    with pytest.raises(InputError, match="depth bias"):
+        DepthBias(covariance=np.array(wrong))

@@ -28,7 +28,9 @@ def document(calibration: Calibration) -> dict[str, Any]:
     """The content of an extrinsics file."""
     world = {"up": UP_VECTORS[calibration.up] if calibration.up else None, "origin": calibration.origin}
     meta = {"format": FORMAT, "version": VERSION, "world": world, **calibration.notes}
-    meta.update({key: dict(of_camera) for key, of_camera in calibration.kept_meta.items() if of_camera})
+    for key, of_camera in calibration.kept_meta.items():
+        if of_camera:
+            meta[key] = dict(sorted({**meta.get(key, {}), **of_camera}.items()))
     fresh = {c.camera: c.covariance for c in calibration.cameras if c.covariance is not None and not c.kept}
     known = {name: [float(x) for x in covariance.ravel()] for name, covariance in fresh.items()}
     if known:

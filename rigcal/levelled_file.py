@@ -1,0 +1,129 @@
+"""An extrinsics file whose rig is levelled: what is read of it, what stays true, what is replaced.
+
+Owns      the rig and its world as the file tells them, the content of the levelled file.
+Leaves    reading and checking poses to kept and formats.native; levelling itself to aruco.ground_plane.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aruco.depth_bias import DepthBias, bias_from_dict
+from aruco.errors import InputError
+from aruco.model import UpAxis
+from aruco.pose_math import Array, Pose, pose_text
+from rigcal.formats import native
+from rigcal.kept import kept_from_file
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RigFile:
+    """The rig of an extrinsics file, in a world that stands upright."""
+
+    name: str
+    digest: str  # SHA-256 of its bytes
+    content: Mapping[str, Any]
+    T_world_cam: Mapping[str, Pose]
+    covariance: Mapping[str, Array]  # (6, 6), where the file has it
+    depth_bias: Mapping[str, DepthBias]  # where it has been estimated
+    up: UpAxis
+    up_is_assumed: bool  # the file does not say it
+
+    @property
+    def meta(self) -> Mapping[str, Any]:
+        """What the file says about itself; empty for a file that has only poses."""
+        meta = self.content.get("_meta")
+        return meta if isinstance(meta, dict) else {}
+
+    @property
+    def origin(self) -> str | None:
+        """What the file says its world's origin is tied to."""
+        world = self.meta.get("world")
+        return world.get("origin") if isinstance(world, dict) else None
+
+    @property
+    def levelled_with(self) -> str | None:
+        """SHA-256 of the depth that the rig was levelled with before."""
+        found: Any = self.meta
+        for key in ("ground_refined", "provenance", "inputs_sha256", "depth"):
+            found = found.get(key) if isinstance(found, dict) else None
+        return found
+
+    @property
+    def apart(self) -> list[str]:
+        """Cameras that stand in worlds of their own (``_meta.parts``)."""
+        parts = self.meta.get("parts")
+        given = [part for part in parts if isinstance(part, dict)] if isinstance(parts, list) else []
+        return sorted({name for part in given for name in part if not name.startswith("_")})
+
+
+def rig_file(path: Path) -> RigFile:
+    """The rig of an extrinsics file, and where up is in its world.
+
+    Raises:
+        InputError: The file cannot be read, holds a pose, covariance or bias that is none, or its world is not upright.
+    """
+    kept, content = kept_from_file(path), native.read_json(path)
+    meta = content.get("_meta")
+    world = meta.get("world") if isinstance(meta, dict) else None
+    says_up = isinstance(world, dict) and "up" in world
+    if says_up and kept.up is None:
+        raise InputError(
+            f"{path}: its world does not stand upright (_meta.world.up is null), so no plane can be told to be the "
+            "floor; run calibrate-extrinsics again with --auto-align."
+        )
+    return RigFile(
+        name=path.name,
+        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
+        content=content,
+        T_world_cam=kept.T_world_cam,
+        covariance=kept.covariance,
+        depth_bias={
+            name: bias_from_dict(entry, f"{path}: camera {name}") for name, entry in kept.meta["depth_bias"].items()
+        },
+        up=kept.up or "+y",
+        up_is_assumed=not says_up,
+    )
+
+
+def levelled_content(
+    given: RigFile,
+    T_world_cam: Mapping[str, Pose],
+    covariance: Mapping[str, Array],
+    note: Mapping[str, Any],
+    *,
+    corrected: Collection[str],
+) -> dict[str, Any]:
+    """The content of the levelled file: all of the given one, but for what levelling has changed.
+
+    Args:
+        given: The file that was levelled; what it says of views, residuals and verdict is still said of them.
+        T_world_cam: Every camera's new pose.
+        covariance: Of these, (6, 6); only cameras that the file had one of are written.
+        note: ``_meta.ground_refined``.
+        corrected: Cameras that were moved beyond the motion common to all.
+    """
+    entries = {
+        name: _entry(given.content[name], T, corrected=name in corrected) for name, T in sorted(T_world_cam.items())
+    }
+    world = given.meta.get("world")
+    meta = {
+        "format": native.FORMAT,
+        "version": native.VERSION,
+        **given.meta,
+        "world": {**(world if isinstance(world, dict) else {}), "up": native.UP_VECTORS[given.up], "origin": "floor"},
+    }
+    if given.covariance:
+        meta["covariance"] = {name: [float(x) for x in covariance[name].ravel()] for name in sorted(given.covariance)}
+    return {**given.content, **entries, "_meta": {**meta, "ground_refined": dict(note)}}
+
+
+def _entry(entry: Mapping[str, Any], T_world_cam: Pose, *, corrected: bool) -> dict[str, Any]:
+    """A camera's entry without what the new pose makes untrue."""
+    # A kept camera is no longer where its old file has it; what was least known of a pose the floor may know well.
+    untrue = {"kept", "least_known"} if corrected else {"kept"}
+    return {**{key: value for key, value in entry.items() if key not in untrue}, "pose": pose_text(T_world_cam)}

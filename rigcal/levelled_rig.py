@@ -1,0 +1,113 @@
+"""A rig on its floor: what was found, and what is derived from it for the file, the terminal and the page.
+
+Owns      the result of levelling; who was levelled on a floor of its own, and who was not.
+Leaves    the order of the steps to levelling, layouts to levelled_file and ground_note, drawing to the room report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from aruco.depth_mask import mask_edges
+from aruco.depth_noise import DepthNoise
+from aruco.ground_plane import GroundPlaneConfig, GroundPlaneMetrics
+from aruco.pose_math import Array, Pose
+from aruco.uncertainty import carried
+from rigcal.ground_note import DepthFile, facts_of, ground_note
+from rigcal.levelled_file import RigFile, levelled_content
+from rigcal.report.floor_views import FloorFigures, FloorView, floor_figures, floor_view
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Levelling:
+    """A rig on its floor, and how it came there."""
+
+    given: RigFile
+    depth_file: DepthFile
+    data: Mapping[str, Mapping[str, Any]]  # camera -> its depth, as ground_plane takes it
+    config: GroundPlaneConfig
+    T_world_cam: Mapping[str, Pose]  # on the floor
+    metrics: GroundPlaneMetrics
+
+    @property
+    def partial(self) -> dict[str, str]:
+        """Cameras that were moved with the whole rig only, or not at all, and why."""
+        why = {name: reason for name, reason in self.metrics.without_floor.items() if name in self.data}
+        why |= dict.fromkeys(self.given.T_world_cam.keys() - self.data.keys(), "it has no depth in the store")
+        why |= {name: c.reason for name, c in self.metrics.corrections.items() if not c.accepted}
+        why |= dict.fromkeys(self.given.apart, "it stands in a world of its own (_meta.parts), which stays as it was")
+        return dict(sorted(why.items()))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every camera was levelled on the floor that it sees itself."""
+        return not self.partial
+
+    @property
+    def up_y(self) -> int:
+        """1 if the world's y axis points up, -1 if down."""
+        return 1 if self.config.up[1] > 0 else -1
+
+    @property
+    def floor_y(self) -> float:
+        """Where the floor is."""
+        return self.config.target_floor_y
+
+    @property
+    def T_before_cam(self) -> dict[str, Pose]:
+        """Every camera's pose as if the rig had only been moved as a whole."""
+        return {name: self.metrics.T_level_world @ T for name, T in sorted(self.given.T_world_cam.items())}
+
+    @property
+    def covariance(self) -> dict[str, Array]:
+        """(6, 6) of the new poses of cameras whose file had one."""
+        new, T = self.metrics.covariances, self.metrics.T_level_world
+        return {name: new[name] if name in new else carried(S, T) for name, S in self.given.covariance.items()}
+
+    @property
+    def note(self) -> dict[str, Any]:
+        """The entry ``_meta.ground_refined``."""
+        return ground_note(self.given, self.depth_file, self.metrics, self.partial, self.config)
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The new extrinsics file."""
+        corrected = [name for name, c in self.metrics.corrections.items() if c.accepted]
+        return levelled_content(self.given, self.T_world_cam, self.covariance, self.note, corrected=corrected)
+
+    @property
+    def facts(self) -> tuple[str, ...]:
+        """Sentences about the whole rig."""
+        return facts_of(self.metrics, self.config)
+
+    @property
+    def figures(self) -> tuple[FloorFigures, ...]:
+        """What is told of each camera."""
+        seen, why = self.metrics.corrections, self.partial
+        return tuple(
+            floor_figures(name, T, self.T_world_cam[name], seen.get(name), reason=why.get(name, ""), up_y=self.up_y)
+            for name, T in self.T_before_cam.items()
+        )
+
+    def views(self) -> tuple[FloorView, ...]:
+        """What is drawn of each camera with depth: without bias, and without the wrong depth beside edges."""
+        return tuple(self._view(name, T) for name, T in self.T_before_cam.items() if name in self.data)
+
+    def _view(self, camera: str, T_before_cam: Pose) -> FloorView:
+        data = self.data[camera]
+        depth, K = data["depth"], np.asarray(data["K"], dtype=np.float64)
+        focal_baseline = float(K[0, 0]) * data["baseline"] if data["baseline"] else None
+        unbiased = data["bias"].corrected(depth) if "bias" in data else depth
+        return floor_view(
+            camera,
+            np.where(mask_edges(depth, focal_baseline=focal_baseline), np.nan, unbiased),
+            K,
+            T_before_cam=T_before_cam,
+            T_after_cam=self.T_world_cam[camera],
+            floor=self.metrics.camera_planes.get(camera),
+            sigma_m=lambda z: DepthNoise(focal_baseline=focal_baseline).averaged_sigma_m(z, data["n_frames"]),
+        )

@@ -1,0 +1,76 @@
+"""The files that levelling writes: poses, and beside them metrics and a page.
+
+Owns      which there are, that none replaces an input or another, writing them.
+Leaves    their contents to levelling and the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from aruco.atomic import check_writable, write_whole
+from aruco.errors import OutputError
+from rigcal.cli import beside
+from rigcal.formats.native import write_json
+from rigcal.levelled_rig import Levelling
+from rigcal.report.floor_page import floor_page
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevellingOutputs:
+    """Where everything goes."""
+
+    poses: Path
+    metrics: Path | None = None
+    page: Path | None = None
+
+    @staticmethod
+    def asked_for(given: Mapping[str, Any]) -> LevellingOutputs:
+        """The outputs that the options of the command name.
+
+        Raises:
+            OutputError: One would replace an input or another output, or cannot be written.
+        """
+        poses, page = given["output_extrinsics"], given["plot_output"]
+        if given["plot"] and page is None:
+            page = beside(poses, ".html")
+        outputs = LevellingOutputs(poses=poses, metrics=given["metrics_json"], page=page)
+        for path in outputs.paths:
+            for option in ("input_extrinsics", "input_depth"):
+                if path.resolve() == given[option].resolve():
+                    flag = option.replace("_", "-")
+                    raise OutputError(f"{path}: is --{flag}, an input, which is never changed; choose another name.")
+        for one, other in combinations(outputs.paths, 2):
+            if one.resolve() == other.resolve():
+                raise OutputError(f"{one}: two outputs have this name; give each its own.")
+        for path in outputs.paths:
+            check_writable(path)
+        return outputs
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files that will be written, the poses last: they appear only beside all that was asked for."""
+        return [path for path in (self.metrics, self.page, self.poses) if path is not None]
+
+    def write(self, levelling: Levelling) -> None:
+        """Write every file whole or not at all.
+
+        Raises:
+            OutputError: One cannot be written.
+        """
+        page = "" if self.page is None else _page(levelling)  # whatever can fail comes before the first file
+        if self.metrics is not None:
+            write_json(self.metrics, {"format": "rigcal.ground_refined", "version": 1, **levelling.note})
+        if self.page is not None:
+            write_whole(self.page, page.encode())
+        write_json(self.poses, levelling.content)
+
+
+def _page(levelling: Levelling) -> str:
+    return floor_page(
+        levelling.views(), levelling.figures, levelling.facts, up_y=levelling.up_y, floor_y=levelling.floor_y
+    )

@@ -1,0 +1,46 @@
+"""The end of levelling in a terminal: every camera's floor before and after, and what was done."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rigcal.report.floor_views import FloorFigures
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def show_levelling(out: Console, figures: Sequence[FloorFigures], facts: Sequence[str]) -> None:
+    """Print the table, and below it what holds for the whole rig."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title="Every camera's floor against the common one", title_justify="left")
+    table.add_column("camera")
+    for name in ("tilt deg\nbefore", "tilt deg\nafter", "height mm\nbefore", "height mm\nafter",
+                 "turned by\ndegrees", "raised by\nmm"):  # fmt: skip
+        table.add_column(name, justify="right")
+    table.add_column("outcome")
+    for f in figures:
+        table.add_row(
+            escape(f.camera),
+            _told(f.tilt_before_deg, ".3f"),
+            _told(f.tilt_after_deg, ".3f"),
+            _told(f.height_before_mm, "+.1f"),
+            _told(f.height_after_mm, "+.1f"),
+            _told(f.turned_deg, ".3f"),
+            _told(f.raised_mm, "+.1f"),
+            escape(f.outcome),
+        )
+    out.print(table)
+    for f in figures:
+        if f.reason:
+            out.print(f"{f.outcome}: camera {f.camera}: {f.reason}", markup=False)
+    for fact in facts:
+        out.print(fact, markup=False)
+
+
+def _told(value: float, form: str) -> str:
+    return "-" if math.isnan(value) else f"{value:{form}}"
