@@ -99,6 +99,11 @@ class Camera:
         return _frozen_array(padded, (max(allowed),), f"{who}: distortion_coefficients")
 
     @property
+    def K_depth(self) -> Array:
+        """(3, 3) of the depth image."""
+        return self.K if self.depth_K is None else self.depth_K
+
+    @property
     def has_distortion(self) -> bool:
         """Whether pixels differ from those of a pinhole with the same K."""
         return self.distortion_model == "equidistant" or bool(self.distortion.any())
@@ -135,6 +140,10 @@ class Recording(Protocol):
 
     def stamps_ns(self, camera: str) -> NDArray[np.int64]:
         """The sorted time stamps of a camera's frames, without decoding them."""
+        ...
+
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        """Ascending indices of the camera's frames that have depth, as far as is known without decoding them."""
         ...
 
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:

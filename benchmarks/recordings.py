@@ -32,6 +32,10 @@ class HeldRecording:
         """As those of the source."""
         return self._source.stamps_ns(camera)
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        """As those of the source."""
+        return self._source.depth_indices(camera)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         """The source's; what is asked for with depth is not kept."""
         if depth:
@@ -66,6 +70,10 @@ class ExchangedRecording:
         """As those of the source."""
         return self._source.stamps_ns(camera)
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        """As those of the source."""
+        return self._source.depth_indices(camera)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         """The source's, two of them exchanged."""
         if camera != self._camera:
@@ -97,6 +105,10 @@ class PartRecording:
     def stamps_ns(self, camera: str) -> NDArray[np.int64]:
         """Those of the frames that are left."""
         return self._source.stamps_ns(camera)[self._indices[camera]]
+
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        """Those of the frames that are left."""
+        return np.flatnonzero(np.isin(self._indices[camera], self._source.depth_indices(camera)))
 
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         """The source's."""

@@ -44,6 +44,10 @@ class BentRecording:
         """As those of the linear one."""
         return self._linear.stamps_ns(camera)
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        """As those of the linear one."""
+        return self._linear.depth_indices(camera)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         """The linear one's, bent."""
         for frame in self._linear.frames(camera, indices, depth=depth):

@@ -1,38 +1,46 @@
 """Every camera's depth over the whole recording, pooled to one clean image.
 
-Owns      which images are read, several cameras at a time, and cameras without depth.
+Owns      which images are read, several cameras at a time, and cameras without usable depth.
 Leaves    pooling to aruco.depth_pool.
 """
 
 from __future__ import annotations
 
+import hashlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
+from itertools import chain
 
+import numpy as np
 from loguru import logger
 
+from aruco.camera_depth import check_camera, check_name
 from aruco.depth_pool import DepthFrame, pool_depth, spread_indices
 from aruco.depth_save import CameraDepth, camera_depth
 from aruco.errors import InputError
 from aruco.model import BadFrame, Camera, Progress, Recording
 
-# Images can be recorded more often than depth, but not many times more: a camera without in so many has none.
-LOOKED_AT = 8
-
 
 def require_depth(recording: Recording) -> None:
-    """Say early that there is nothing to pool.
+    """Say early what could not be pooled or kept: before the long work, not after it.
 
     Raises:
-        InputError: No camera has depth among the images looked at.
+        InputError: No camera has depth, or the first depth image of one is none, is in other units, or has intrinsics
+            of another size.
     """
-    if not any(_has_depth(recording, camera) for camera in recording.cameras):
+    cameras = [camera for camera in recording.cameras if len(recording.depth_indices(camera.name))]
+    if not cameras:
         raise InputError(
             "The recording has no depth images, which --save-depth and --verify-depth read: they belong in "
             "<camera>/depth/<stamp_ns>.png or .npy; record them, or leave these options out."
         )
+    for camera in cameras:
+        check_name(camera.name, "the recording")
+        first = next(_depth_frames(recording, camera, recording.depth_indices(camera.name).tolist()), None)
+        if first is not None:
+            where = f"camera {camera.name}: depth"
+            check_camera(camera_depth(pool_depth([first], where=where), K=camera.K_depth), where)
 
 
 def pool_recording(
@@ -47,45 +55,48 @@ def pool_recording(
         progress: Is told of every image.
 
     Raises:
-        InputError: No camera has depth, or a depth image is none, or in other units.
+        InputError: A depth image is none, or in other units.
     """
-    cameras = [camera for camera in recording.cameras if _has_depth(recording, camera)]
-    for camera in sorted({c.name for c in recording.cameras} - {c.name for c in cameras}):
-        logger.warning("camera {}: no depth images, so depth says nothing about it", camera)
-    chosen = {camera.name: spread_indices(len(recording.stamps_ns(camera.name))) for camera in cameras}
-    count = _Counter(progress, sum(map(len, chosen.values())))
+    chosen = {camera.name: _spread(recording.depth_indices(camera.name).tolist()) for camera in recording.cameras}
+    counter = _Counter(progress, sum(map(len, chosen.values())))
 
     def pooled(camera: Camera) -> CameraDepth | None:
-        frames = _depth_frames(recording, camera, chosen[camera.name], count)
-        found = pool_depth(frames, where=f"camera {camera.name}: depth")
-        if not found.count.any():
-            logger.warning(
-                "camera {}: its depth images agree nowhere, as if it had been moved; they are left out", camera.name
-            )
+        frames = _depth_frames(recording, camera, chosen[camera.name], counter)
+        first = next(frames, None)
+        if first is None:
+            logger.warning("camera {}: no depth that can be read, so depth says nothing about it", camera.name)
             return None
-        K = camera.K if camera.depth_K is None else camera.depth_K
-        return camera_depth(found, K=K, baseline_m=camera.baseline_m or baseline_m)
+        found = pool_depth(chain([first], frames), where=f"camera {camera.name}: depth")
+        if not found.count.any():
+            logger.warning("camera {}: its depth images agree nowhere, as if it had been moved: left out", camera.name)
+            return None
+        return camera_depth(found, K=camera.K_depth, baseline_m=camera.baseline_m or baseline_m)
 
     # Each camera holds its images until they are pooled: two at a time keep memory flat.
     with ThreadPoolExecutor(max_workers=max(1, min(jobs, 2))) as pool:
-        results = zip(cameras, pool.map(pooled, cameras))
+        results = zip(recording.cameras, pool.map(pooled, recording.cameras))
         return {camera.name: depth for camera, depth in results if depth is not None}
 
 
-def _has_depth(recording: Recording, camera: Camera) -> bool:
-    """Whether any of the first images has depth; unreadable ones do not count."""
-    indices = range(len(recording.stamps_ns(camera.name)))
-    frames = recording.frames(camera.name, indices, depth=True)
-    read = islice((f for f in frames if not isinstance(f, BadFrame)), LOOKED_AT)
-    return any(frame.depth_m is not None for frame in read)
+def depth_digest(depth: CameraDepth) -> str:
+    """SHA-256 of pooled depth and of the intrinsics that it is read with."""
+    return hashlib.sha256(depth.depth.tobytes() + depth.K.tobytes() + repr(depth.baseline_m).encode()).hexdigest()
 
 
-def _depth_frames(recording: Recording, camera: Camera, indices: list[int], count: _Counter) -> Iterator[DepthFrame]:
+def _spread(indices: Sequence[int]) -> list[int]:
+    """A bounded number of these, from all over the recording."""
+    return [indices[k] for k in spread_indices(len(indices))]
+
+
+def _depth_frames(
+    recording: Recording, camera: Camera, indices: Sequence[int], counter: _Counter | None = None
+) -> Iterator[DepthFrame]:
     for frame in recording.frames(camera.name, indices, depth=True):
-        count.tick()
+        if counter is not None:
+            counter.tick()
         if isinstance(frame, BadFrame):
             logger.debug("camera {}: depth left out: {}", camera.name, frame.reason)
-        elif frame.depth_m is not None:
+        elif frame.depth_m is not None and np.isfinite(frame.depth_m).any():
             yield frame.stamp_ns, frame.depth_m, frame.confidence
 
 

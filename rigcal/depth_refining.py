@@ -34,6 +34,9 @@ from rigcal.validation_case import Case, case_of
 
 __all__ = ["DepthRefinement", "refine_with_depth"]
 
+# A bias without a standard deviation was estimated to about a tenth of what is usual.
+KNOWN_SHARE = 0.1
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Eye:
@@ -55,6 +58,7 @@ def refine_with_depth(
     baseline_m: float | None = None,
     max_rotation_deg: float = 5.0,
     max_translation_m: float = 0.1,
+    known: Mapping[str, DepthBias] | None = None,
     seed: int = 0,
 ) -> DepthRefinement:
     """Correct an adjusted rig with its depth, and estimate every camera's depth bias.
@@ -69,6 +73,7 @@ def refine_with_depth(
         baseline_m: Of cameras whose recording does not say.
         max_rotation_deg: No camera is turned farther.
         max_translation_m: Nor moved.
+        known: Biases of cameras that an earlier calibration knows; their depth comes without them.
         seed: Taken for the sake of the other steps; halves are chosen by place, so nothing is left to chance.
 
     Returns:
@@ -79,7 +84,7 @@ def refine_with_depth(
     kept = _measured_frames(case, joint.rig, faces)
     markers, halves = marker_equations(case, kept, world, _beyond(case, joint, evidence, world))
     named = _frames_named(markers, joint.rig, case)
-    eyes = {camera.name: _eye(camera, model, baseline_m) for camera in case.cameras}
+    eyes = {c.name: _eye(c, model, baseline_m, (known or {}).get(c.name)) for c in case.cameras}
     views = {name: _view(pooled[name], eyes[name], joint.rig, name) for name in eyes if name in pooled}
     floor = _floor(views, joint.rig, evidence)
     tiles = _tiles(named, faces, views, eyes, floor, pooled, joint.rig)
@@ -139,11 +144,13 @@ def _beyond(case: Case, joint: JointRig, evidence: Evidence, world: int | None) 
     return np.block(rows) - plain
 
 
-def _eye(camera: Camera, model: DepthModel, baseline_m: float | None) -> _Eye:
-    K = camera.K if camera.depth_K is None else camera.depth_K
-    known = camera.baseline_m or baseline_m
-    fB = float(K[0, 0]) * known if known and model == "stereo" else None
+def _eye(camera: Camera, model: DepthModel, baseline_m: float | None, known: DepthBias | None) -> _Eye:
+    K, B = camera.K_depth, camera.baseline_m or baseline_m
+    fB = float(K[0, 0]) * B if B and model == "stereo" else None
     prior = bias_prior(fB, model)
+    if known is not None:
+        # What is left of a known bias is what was not known of it.
+        prior = KNOWN_SHARE**2 * prior if known.covariance is None or known.model != model else known.covariance
     sensor = DepthSensor(model=model, focal_baseline=fB, prior=prior, lean_unit=1.0 / (fB or DEFAULT_FOCAL_BASELINE))
     return _Eye(K=K, noise=DepthNoise(focal_baseline=fB), sensor=sensor)
 

@@ -10,8 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 from loguru import logger
 
+from aruco.camera_depth import CameraDepth
 from aruco.depth_bias import DepthBias, bias_from_dict
 from aruco.depth_patches import FaceDepth
 from aruco.depth_verify import DepthAgreement, verify_depth
@@ -61,8 +63,9 @@ def hear_depth(
         average,
         joint,
         evidence,
-        faces,
-        evidence.pooled,
+        {name: _unbiased(of_camera, known.get(name)) for name, of_camera in faces.items()},
+        {name: _pooled_unbiased(depth, known.get(name)) for name, depth in evidence.pooled.items()},
+        known=known,
         model=wish.model,
         baseline_m=wish.baseline_m,
         max_rotation_deg=wish.max_rotation_deg,
@@ -73,11 +76,28 @@ def hear_depth(
     if not refined.accepted:
         logger.warning("depth corrects nothing: {}", refined.reason)
         return DepthTestimony(rig=rig, agreement=before, notes=notes)
-    moved, biases = _corrected(rig, refined), {**refined.biases, **known}
+    moved = _corrected(rig, refined)
+    found = {name: bias for name, bias in sorted(refined.biases.items()) if name not in known}
+    biases = {**found, **known}
     after = _agreement(faces, moved, evidence, biases)
     notes["depth_refined"]["verified"] = _told(after)
-    notes["depth_bias"] = {name: bias.as_dict() for name, bias in sorted(refined.biases.items())}
+    notes["depth_bias"] = {name: bias.as_dict() for name, bias in found.items()}
     return DepthTestimony(rig=moved, covariance=refined.covariance, agreement=before, corrected=after, notes=notes)
+
+
+def _unbiased(faces: Sequence[FaceDepth], bias: DepthBias | None) -> list[FaceDepth]:
+    """Faces without a bias that an earlier calibration knows."""
+    if bias is None:
+        return list(faces)
+    return [
+        replace(face, measured_m=bias.corrected(face.measured_m), corner_depth_m=bias.corrected(face.corner_depth_m))
+        for face in faces
+    ]
+
+
+def _pooled_unbiased(depth: CameraDepth, bias: DepthBias | None) -> CameraDepth:
+    """Pooled depth likewise."""
+    return depth if bias is None else replace(depth, depth=bias.corrected(depth.depth).astype(np.float32))
 
 
 def _agreement(

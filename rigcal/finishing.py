@@ -119,7 +119,13 @@ def _corrected(solved: _Solved, depth: DepthTestimony, evidence: Evidence) -> _S
     """The part as depth has corrected it, or as it was."""
     if depth.rig is solved.rig or solved.joint is None:
         return solved
-    joint = replace(solved.joint, covariance={**solved.joint.covariance, **depth.covariance})
+    before = solved.joint
+    corrected = replace(
+        before.rig,
+        cameras={**before.rig.cameras, **depth.rig.cameras},
+        T_world_target={**before.rig.T_world_target, **depth.rig.T_world_target},
+    )
+    joint = replace(before, rig=corrected, covariance={**before.covariance, **depth.covariance})
     residuals = {**solved.residuals, **_reprojected(depth.rig, joint, evidence)}
     return _Solved(rig=depth.rig, joint=joint, residuals=residuals)
 

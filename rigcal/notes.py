@@ -12,6 +12,7 @@ import numpy as np
 
 from aruco.pose_math import Array
 from rigcal import __version__
+from rigcal.depth_pooling import depth_digest
 from rigcal.detecting import Seen, digest_of
 from rigcal.evidence import Evidence
 from rigcal.frames import Moments
@@ -85,8 +86,9 @@ def provenance(evidence: Evidence, kept: KeptRig) -> dict[str, Any]:
     """Version, every option that changes the result, and hashes of the inputs."""
     inputs = {camera.name: digest_of(evidence.seen[camera.name], camera) for camera in evidence.cameras}
     fixed = {"fixed_cameras": kept.digest} if kept.digest else {}
+    depth = {"depth": {name: depth_digest(depth) for name, depth in evidence.pooled.items()}} if evidence.pooled else {}
     return {
         "rigcal": __version__,
         "options": evidence.config.as_dict(),
-        "inputs_sha256": {"target": evidence.target.digest, "cameras": inputs, **fixed},
+        "inputs_sha256": {"target": evidence.target.digest, "cameras": inputs, **depth, **fixed},
     }

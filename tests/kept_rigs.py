@@ -38,6 +38,9 @@ class NoImages:
     def stamps_ns(self, camera: str) -> NDArray[np.int64]:
         return np.arange(self.n) * 1_000_000_000
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        return np.arange(0)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         yield from ()
 

@@ -31,6 +31,9 @@ class Numbered:
         every = PERIOD_NS * np.arange(6, dtype=np.int64)
         return every if camera == "a" else np.delete(every, 1)
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        return np.arange(len(self.stamps_ns(camera)))
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame]:
         for index in indices:
             self.reads += 1

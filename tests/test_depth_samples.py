@@ -131,6 +131,9 @@ class Watched:
     def stamps_ns(self, camera: str) -> NDArray[np.int64]:
         return self.recording.stamps_ns(camera)
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        return np.empty(0, np.int64) if camera == self.blind else self.recording.depth_indices(camera)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         for index, frame in zip(indices, self.recording.frames(camera, indices, depth=depth)):
             if depth:

@@ -64,6 +64,9 @@ class Changed:
     def stamps_ns(self, camera: str) -> NDArray[np.int64]:
         return self.recording.stamps_ns(camera)
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        return self.recording.depth_indices(camera)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         for frame in self.recording.frames(camera, indices, depth=depth):
             self.reads += 1

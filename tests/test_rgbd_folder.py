@@ -86,6 +86,9 @@ class InMemory:
     def stamps_ns(self, camera: str) -> NDArray[np.int64]:
         return np.array([5, 33 * MS, 66 * MS], dtype=np.int64)
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        return np.array([] if camera == "left" else [0, 2], dtype=np.int64)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         for i in indices:
             stamp_ns = int(self.stamps_ns(camera)[i])

@@ -85,6 +85,10 @@ class SimulatedRecording:
         skew = generator(self._seed, Purpose.CLOCK, self._known(camera)).integers(0, _MAX_SKEW_NS)
         return _FIRST_STAMP_NS + _PERIOD_NS * np.arange(self._rig.n_frames, dtype=np.int64) + skew
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        """All frames, if the rig has depth."""
+        return np.arange(len(self.stamps_ns(camera)) if self._rig.depth else 0)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame]:
         """A camera's frames at ascending indices; with depth if asked for and the rig has it.
 

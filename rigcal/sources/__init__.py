@@ -100,6 +100,10 @@ class _Joined:
         """The sorted time stamps of a camera's frames."""
         return self._owner(camera).stamps_ns(camera)
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        """Ascending indices of the camera's frames that have depth."""
+        return self._owner(camera).depth_indices(camera)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         """A camera's frames at ascending indices into its stamps, one at a time."""
         return self._owner(camera).frames(camera, indices, depth=depth)

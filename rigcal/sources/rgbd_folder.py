@@ -65,6 +65,10 @@ class RgbdFolder:
         """The sorted time stamps of a camera's images; raises InputError for an unknown camera."""
         return self._folder(camera).image.stamps_ns
 
+    def depth_indices(self, camera: str) -> NDArray[np.int64]:
+        """Ascending indices of the images that a depth file belongs to."""
+        return np.flatnonzero(self._folder(camera).depth_of >= 0)
+
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         """A camera's frames at ascending indices into its stamps, read one at a time.
 
