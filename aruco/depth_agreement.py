@@ -73,8 +73,8 @@ class DepthRow:
     y_px: float
     predicted_m: float
     recorded_m: float  # before any correction
-    error_m: float  # of the corrected measurement; positive: too far
-    sigma_m: float  # of one pixel; of a face that of its median
+    error_m: float  # of the corrected measurement, of a face the median of its pixels; positive: too far
+    sigma_m: float  # standard deviation of error_m that the noise model promises; no pose has a part in it
     n_pixels: int  # of a face those that took part
     n_averaged: int  # depth images pooled
 

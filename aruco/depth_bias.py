@@ -84,12 +84,6 @@ class DepthBias:
             **self._doubt("disparity_px", self.focal_baseline),
         }
 
-    def sigma_m(self, depth_m: Array) -> Array:
-        """What is still unknown of corrected depth [m] at measured depth (n,); zero without a covariance."""
-        J = self.derivative(depth_m)
-        S = np.zeros((2, 2)) if self.covariance is None else self.covariance
-        return np.sqrt(np.maximum(np.einsum("in,ij,jn->n", J, S, J), 0.0))
-
     def _doubt(self, second: str, unit: float = 1.0) -> dict[str, float]:
         """The covariance as plain numbers; the second parameter is written in ``unit`` times its own unit."""
         if self.covariance is None:
@@ -118,13 +112,31 @@ def bias_from_dict(entry: Any, where: str) -> DepthBias:
     """A bias as ``_meta.depth_bias`` holds it; ``where`` names file and camera.
 
     Raises:
-        InputError: It is none of the three layouts.
+        InputError: It is none of the three layouts, or its numbers are no bias.
     """
+    try:
+        return _bias_of(_numbers(entry))
+    except InputError as error:
+        raise InputError(f"{where}: {error} Run --refine-depth again.") from error
+
+
+def _numbers(entry: Any) -> dict[str, float]:
+    """An entry's values, all of them finite."""
     if not isinstance(entry, Mapping) or not all(
         isinstance(x, (int, float)) and not isinstance(x, bool) for x in entry.values()
     ):
-        raise InputError(f"{where}: the depth bias is not an object of numbers; run --refine-depth again.")
-    given: dict[str, float] = {str(name): float(x) for name, x in entry.items()}
+        raise InputError("the depth bias is not an object of numbers.")
+    try:
+        given = {str(name): float(x) for name, x in entry.items()}
+    except OverflowError:
+        raise InputError("the depth bias holds a number that is too large for any.") from None
+    for name, value in given.items():
+        if not math.isfinite(value) or (name.startswith("sigma_") and value < 0):
+            raise InputError(f"the depth bias holds {name} {value:g}, which cannot be.")
+    return given
+
+
+def _bias_of(given: Mapping[str, float]) -> DepthBias:
     scale = given.get("scale", 0.0)
     if "offset_m" in given:
         covariance = _covariance_of(given, "offset_m")
@@ -138,10 +150,7 @@ def bias_from_dict(entry: Any, where: str) -> DepthBias:
         return DepthBias(
             scale=scale, inverse_depth=given["disparity_px"] / fB, focal_baseline=fB, covariance=covariance
         )
-    raise InputError(
-        f"{where}: the depth bias wants scale with disparity_px and focal_baseline, inverse_depth, or offset_m; run "
-        "--refine-depth again."
-    )
+    raise InputError("the depth bias wants scale with disparity_px and focal_baseline, inverse_depth, or offset_m.")
 
 
 def _covariance_of(given: Mapping[str, float], second: str, unit: float = 1.0) -> Array | None:
@@ -149,7 +158,8 @@ def _covariance_of(given: Mapping[str, float], second: str, unit: float = 1.0) -
     if "sigma_scale" not in given or f"sigma_{second}" not in given:
         return None
     sigma = np.array([given["sigma_scale"], given[f"sigma_{second}"] / unit])
-    covariance = np.outer(sigma, sigma)
-    covariance[0, 1] *= given.get("correlation", 0.0)
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers without bounds become infinite, and are refused
+        covariance = np.outer(sigma, sigma)
+        covariance[0, 1] *= given.get("correlation", 0.0)
     covariance[1, 0] = covariance[0, 1]
     return covariance

@@ -6,15 +6,18 @@ Leaves    what all tiles together say to depth_fusion, which pixels belong to a 
 Neighbouring pixels of a stereo matcher share their errors, so a square of them is about one measurement. Inverse depth
 of a plane is linear in a pixel's ray (x, y, 1), and so is a stereo camera's bias: in inverse depth the mean over a
 tile obeys the same equation as a pixel, without any error of averaging.
+
+What is fixed of a pixel's error belongs to the camera: whatever lies there in another frame has it again. A target that
+is waved in one place is not measured anew in each frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from aruco.depth_noise import CORRELATION_PX, TEMPORAL_CORRELATION_PX, DepthNoise
 from aruco.depth_patches import FaceDepth
@@ -87,6 +90,35 @@ def plane_in_camera(normal: Array, offset_m: float, T_cam_frame: Pose) -> Array:
     return n / (offset_m + float(n @ T_cam_frame[:3, 3]))
 
 
+def predicted_inverse(tiles: Tiles, T_cam_target: Sequence[Pose]) -> Array:
+    """Inverse depth (n,) [1/m] that tiles of one camera's faces should have, with its poses of the targets."""
+    T = np.asarray(T_cam_target, dtype=np.float64).reshape(-1, 4, 4)[tiles.target]
+    n = np.einsum("nij,nj->ni", T[:, :3, :3], tiles.normal)
+    return (n * tiles.ray).sum(axis=1) / (tiles.offset_m + (n * T[:, :3, 3]).sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Surface:
+    """What is known of a flat surface beside its depth."""
+
+    camera: int = 0
+    target: int = FLOOR
+    normal: Array = field(default_factory=lambda: np.zeros(3))
+    offset_m: float = 0.0
+    n_averaged: float = 1.0
+    uneven_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Squares:
+    """Squares of the image on one surface."""
+
+    cell: NDArray[np.int64]  # (n, 2) column and row, in tiles
+    area_px: Array  # (n,) pixels of the image that took part
+    ray: Array  # (n, 3) mean of (x, y, 1)
+    inverse: Array  # (n,) mean of 1 / measured depth [1/m]
+
+
 def face_tiles(
     faces: Sequence[FaceDepth],
     camera: int,
@@ -98,7 +130,7 @@ def face_tiles(
     """The tiles of a camera's faces.
 
     Args:
-        faces: Of one camera.
+        faces: Of one camera; all of them at once, or what they share is not seen.
         camera: Its index.
         targets: Frames with a pose of the target; faces of others are left out.
         T_cam_target: The poses of these, near the truth.
@@ -106,33 +138,23 @@ def face_tiles(
         noise: Of this camera.
     """
     number = {frame: k for k, frame in enumerate(targets)}
-    parts: list[Tiles] = []
+    found: list[tuple[_Surface, _Squares]] = []
     for face in faces:
         k = number.get(face.frame)
         if k is None:
             continue
         q = plane_in_camera(face.normal_target, face.offset_m, T_cam_target[k])
         trusted = face.trusted
-        tiles = surface_tiles(
-            face.pixels[trusted],
-            face.measured_m[trusted],
-            q,
-            K,
-            noise,
+        surface = _Surface(
+            camera=camera,
+            target=k,
+            normal=face.normal_target,
+            offset_m=face.offset_m,
             n_averaged=face.n_averaged,
             uneven_m=FACE_UNEVEN_M,
         )
-        ones = np.ones(len(tiles))
-        parts.append(
-            replace(
-                tiles,
-                camera=np.full(len(tiles), camera),
-                target=np.full(len(tiles), k),
-                normal=ones[:, None] * face.normal_target,
-                offset_m=ones * face.offset_m,
-            )
-        )
-    return joined(parts)
+        found.append((surface, _squares(face.pixels[trusted], face.measured_m[trusted], q, K, noise)))
+    return _as_tiles(found, noise)
 
 
 def floor_tiles(
@@ -161,24 +183,14 @@ def floor_tiles(
         stride: See pixels.
     """
     q = plane_in_camera(*floor, invert_transform(T_world_cam))
-    tiles = surface_tiles(
-        pixels, measured_m, q, K, noise, n_averaged=n_averaged, uneven_m=FLOOR_UNEVEN_M, stride=stride
-    )
-    return replace(tiles, camera=np.full(len(tiles), camera))
+    surface = _Surface(camera=camera, n_averaged=n_averaged, uneven_m=FLOOR_UNEVEN_M)
+    return _as_tiles([(surface, _squares(pixels, measured_m, q, K, noise, stride=stride))], noise)
 
 
 def surface_tiles(
-    pixels: Array,
-    measured_m: Array,
-    q: Array,
-    K: Array,
-    noise: DepthNoise,
-    *,
-    n_averaged: float,
-    uneven_m: float,
-    stride: int = 1,
+    pixels: Array, measured_m: Array, q: Array, K: Array, noise: DepthNoise, *, n_averaged: float, uneven_m: float
 ) -> Tiles:
-    """Tiles of one flat surface, of camera 0 and on the floor until the caller says otherwise.
+    """Tiles of one flat surface that belongs to nothing: as if camera 0 had seen it on the floor.
 
     Args:
         pixels: (n, 2) on the surface.
@@ -188,59 +200,113 @@ def surface_tiles(
         noise: Of one pixel.
         n_averaged: Depth images that were pooled.
         uneven_m: How flat the surface is [m].
-        stride: The pixels are every stride-th in both directions.
     """
+    surface = _Surface(n_averaged=n_averaged, uneven_m=uneven_m)
+    return _as_tiles([(surface, _squares(pixels, measured_m, q, K, noise))], noise)
+
+
+def _squares(pixels: Array, measured_m: Array, q: Array, K: Array, noise: DepthNoise, *, stride: int = 1) -> _Squares:
+    """Squares of a surface that is expected at q; pixels (n, 2) are every stride-th in both directions."""
     if len(pixels) < MIN_PIXELS:
-        return _nothing()
+        empty = np.empty(0)
+        return _Squares(cell=np.empty((0, 2), dtype=np.int64), area_px=empty, ray=np.empty((0, 3)), inverse=empty)
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
     inverse = 1.0 / measured_m
     column, row = (pixels // TILE_PX).astype(np.int64).T
-    tile = row * (int(column.max()) + 1) + column
-    off = inverse - rays @ q
-    keep, rough = _belongs(off, tile, _pixel_sigma(measured_m, noise))
-    rays, inverse, measured_m, tile, pixels = rays[keep], inverse[keep], measured_m[keep], tile[keep], pixels[keep]
-    labels, first, index, count = np.unique(tile, return_index=True, return_inverse=True, return_counts=True)
+    width = int(column.max()) + 1
+    tile = row * width + column
+    keep, rough = _belongs(inverse - rays @ q, tile, _pixel_sigma(measured_m, noise))
+    labels, index, count = np.unique(tile[keep], return_inverse=True, return_counts=True)
     enough = (count >= max(MIN_PIXELS, (TILE_PX // stride) ** 2 // 8)) & ~np.isin(labels, rough)
-    mean_ray = np.stack([np.bincount(index, x) for x in rays.T], axis=1) / count[:, None]
-    mean = np.bincount(index, inverse) / count
-    n_tiles = max(int(enough.sum()), 1)
-    sigma = tile_sigma(1.0 / mean, count * float(stride**2), n_tiles, noise, n_averaged=n_averaged, uneven_m=uneven_m)
-    block = (pixels[first] // BLOCK_PX).astype(np.int64)
-    n = len(labels)
-    tiles = Tiles(
-        camera=np.zeros(n, dtype=np.int64),
-        target=np.full(n, FLOOR),
-        normal=np.zeros((n, 3)),
-        offset_m=np.zeros(n),
-        ray=mean_ray,
-        inverse=mean,
-        sigma=sigma,
+    mean_ray = np.stack([np.bincount(index, x) for x in rays[keep].T], axis=1) / count[:, None]
+    return _Squares(
+        cell=np.stack([labels % width, labels // width], axis=1)[enough],
+        area_px=count[enough] * float(stride**2),
+        ray=mean_ray[enough],
+        inverse=(np.bincount(index, inverse[keep]) / count)[enough],
+    )
+
+
+def _as_tiles(found: Sequence[tuple[_Surface, _Squares]], noise: DepthNoise) -> Tiles:
+    """What the squares of one camera's surfaces say, and how sure they are together."""
+    sizes = [len(squares.inverse) for _, squares in found]
+    if not sum(sizes):
+        return _nothing()
+    cell, area_px, ray, inverse = (
+        np.concatenate([getattr(squares, name) for _, squares in found])
+        for name in ("cell", "area_px", "ray", "inverse")
+    )
+    camera, target, normal, offset_m, n_averaged, uneven_m = (
+        np.repeat(np.array([getattr(surface, f.name) for surface, _ in found]), sizes, axis=0) for f in fields(_Surface)
+    )
+    sharing = _sharing(cell, target, area_px)
+    block = cell // (BLOCK_PX // TILE_PX)
+    return Tiles(
+        camera=camera,
+        target=target,
+        normal=normal,
+        offset_m=offset_m,
+        ray=ray,
+        inverse=inverse,
+        sigma=tile_sigma(1.0 / inverse, area_px, sharing, noise, n_averaged=n_averaged, uneven_m=uneven_m),
         block=block[:, 1] * 4096 + block[:, 0],
     )
-    return tiles.only(enough)
+
+
+def _sharing(cell: NDArray[np.int64], target: NDArray[np.int64], area_px: Array) -> Array:
+    """Among how many tiles (n,) each one's fixed error is divided.
+
+    Tiles are treated as independent. They are not, where they are smaller than what shares one error, and where
+    several frames see the same part of the image; so each is taken for as uncertain as makes the mean over all right.
+    No more can share an error than lie in the same cell or beside it.
+
+    Args:
+        cell: (n, 2) column and row.
+        target: (n,) the moment.
+        area_px: (n,) pixels.
+    """
+    place = cell - cell.min(axis=0) + 1
+    shape = tuple(place.max(axis=0) + 2)
+    number, moments = np.zeros(shape), np.zeros(shape)
+    np.add.at(number, tuple(place.T), 1.0)
+    np.add.at(moments, tuple(np.unique(np.column_stack([place, target]), axis=0)[:, :2].T), 1.0)
+    # A border of nothing goes around them, so that nothing comes back on the other side.
+    near = sum(np.roll(number, (i, j), axis=(0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))
+    here = tuple(place.T)
+    return np.clip(moments[here] * CORRELATION_PX**2 / area_px, 1.0, np.asarray(near)[here])
 
 
 def tile_sigma(
-    depth_m: Array, area_px: Array, n_tiles: int, noise: DepthNoise, *, n_averaged: float, uneven_m: float
+    depth_m: ArrayLike,
+    area_px: ArrayLike,
+    sharing: ArrayLike,
+    noise: DepthNoise,
+    *,
+    n_averaged: ArrayLike,
+    uneven_m: ArrayLike,
 ) -> Array:
     """Standard deviation (n,) of a tile's mean inverse depth [1/m].
-
-    Tiles are treated as independent. They are not, where they are smaller than what shares one error; so each of
-    many is taken for as uncertain as makes the mean over all of them right.
 
     Args:
         depth_m: (n,) of the tiles.
         area_px: (n,) pixels of the image that they cover.
-        n_tiles: Of the same surface.
+        sharing: (n,) tiles that have the same fixed error; below one, parts of a tile with errors of their own.
         noise: Of one pixel.
         n_averaged: Depth images that were pooled.
         uneven_m: How flat the surface is [m].
     """
-    fixed = noise.fixed_sigma_m(depth_m)
-    changing2 = np.maximum(noise.sigma_m(depth_m) ** 2 - fixed**2, 0.0) / n_averaged
-    sharing = np.clip(CORRELATION_PX**2 / area_px, 1.0, n_tiles)
-    variance = (fixed**2 + uneven_m**2) * sharing + changing2 * np.minimum(TEMPORAL_CORRELATION_PX**2 / area_px, 1.0)
-    return np.sqrt(variance) / depth_m**2
+    z, area, uneven = (np.asarray(x, dtype=np.float64) for x in (depth_m, area_px, uneven_m))
+    fixed2 = noise.fixed_sigma_m(z) ** 2
+    changing2 = np.maximum(noise.averaged_sigma_m(z, n_averaged) ** 2 - fixed2, 0.0)
+    variance = (fixed2 + uneven**2) * sharing + changing2 * np.minimum(TEMPORAL_CORRELATION_PX**2 / area, 1.0)
+    return np.sqrt(variance) / z**2
+
+
+def face_sigma_m(depth_m: float, n_pixels: int, n_averaged: int, noise: DepthNoise) -> float:
+    """Standard deviation [m] of the typical error of one face, or of a part of it that shares no error with another."""
+    parts = CORRELATION_PX**2 / max(n_pixels, CORRELATION_PX**2)
+    sigma = tile_sigma(depth_m, n_pixels, parts, noise, n_averaged=n_averaged, uneven_m=FACE_UNEVEN_M)
+    return float(sigma) * depth_m**2
 
 
 def _pixel_sigma(measured_m: Array, noise: DepthNoise) -> Array:

@@ -1,7 +1,7 @@
 """How errors of depth go with range and with the place in the image, and what that looks like.
 
-Owns      tiles of neighbouring pixels that count as one measurement, robust slopes with standard errors, likely causes.
-Leaves    the errors to depth_verify, estimating a bias to depth_refine.
+Owns      robust slopes with standard errors, likely causes.
+Leaves    the errors to depth_verify, tiles of neighbouring pixels to depth_tiles, estimating a bias to depth_refine.
 
 Range and place in the image often go together: a target on the floor is nearer the lower it is seen. A slope that the
 other explains as well is marked as not its own.
@@ -10,19 +10,14 @@ other explains as well is marked as not its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from aruco.depth_noise import CORRELATION_PX
 from aruco.pose_math import Array
 
-MIN_TILE_PIXELS = 20
-# Pixels this many robust deviations from the middle of their face are of something before it, or torn.
-_OUTLIER_SIGMAS = 5.0
 _MAD_TO_SIGMA = 1.4826
 # Cauchy's weight at this many sigmas is a half; 95 % efficient on normal errors (Holland and Welsch, 1977).
 _CAUCHY = 2.385
@@ -40,13 +35,14 @@ Cause = Literal["", "scale", "disparity", "offset", "mixed", "unknown"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tiles:
+class TileErrors:
     """Errors of depth, one a tile of neighbouring pixels."""
 
     places: Array  # (n, 2) in normalised image coordinates, x right, y down, 0 at the optical axis
     range_m: Array  # (n,) predicted depth
     errors_m: Array  # (n,)
-    sigma_m: Array  # (n,) standard deviation that the noise model promises
+    sigma_m: Array  # (n,) standard deviation that makes the mean over all right; see depth_tiles
+    alone_m: Array  # (n,) what the noise model promises of a tile among those of its own face
 
     def __len__(self) -> int:
         """How many tiles there are."""
@@ -81,32 +77,7 @@ class Trends:
     cause: Cause  # what the error looks like over range; "" where there is none to explain
 
 
-def tiles_of(pixels: Array, errors_m: Array) -> list[NDArray[np.intp]]:
-    """Indices into the pixels (n, 2) of one face, tile by tile; outliers and tiles of few pixels are left out.
-
-    A tile is as large as fixed errors are shared (depth_noise.CORRELATION_PX): one measurement.
-    """
-    middle = float(np.median(errors_m))
-    spread = _MAD_TO_SIGMA * float(np.median(np.abs(errors_m - middle)))
-    good = np.flatnonzero(np.abs(errors_m - middle) <= _OUTLIER_SIGMAS * spread)
-    cells = np.floor(pixels[good] / CORRELATION_PX).astype(np.int64)
-    _, tile = np.unique(cells, axis=0, return_inverse=True)
-    order = np.argsort(tile.ravel(), kind="stable")
-    parts = np.split(good[order], np.cumsum(np.bincount(tile.ravel()))[:-1])
-    return [part for part in parts if len(part) >= MIN_TILE_PIXELS]
-
-
-def joined(tiles: Sequence[Tiles]) -> Tiles:
-    """Many as one."""
-    return Tiles(
-        places=np.concatenate([t.places for t in tiles] or [np.empty((0, 2))]),
-        range_m=np.concatenate([t.range_m for t in tiles] or [np.empty(0)]),
-        errors_m=np.concatenate([t.errors_m for t in tiles] or [np.empty(0)]),
-        sigma_m=np.concatenate([t.sigma_m for t in tiles] or [np.empty(0)]),
-    )
-
-
-def trends(tiles: Tiles) -> Trends | None:
+def trends(tiles: TileErrors) -> Trends | None:
     """Level and slopes of the errors; None where tiles are too few for a level."""
     if len(tiles) < _TILES_PER_PARAMETER:
         return None
@@ -122,13 +93,13 @@ def trends(tiles: Tiles) -> Trends | None:
     )
 
 
-def _drivers(tiles: Tiles) -> dict[str, Array]:
+def _drivers(tiles: TileErrors) -> dict[str, Array]:
     """What an error may go with, (n,) each; range first."""
     right, down = tiles.places.T
     return {"range": tiles.range_m, "right": right, "down": down, "outwards": np.hypot(right, down)}
 
 
-def _slopes(tiles: Tiles, whole: _Fit) -> dict[str, Trend]:
+def _slopes(tiles: TileErrors, whole: _Fit) -> dict[str, Trend]:
     """Range without regard to the place, the place without regard to range, and which of them explains more.
 
     On a single flat marker range is a function of the place: together they would explain each other away.
@@ -153,7 +124,7 @@ def _slopes(tiles: Tiles, whole: _Fit) -> dict[str, Trend]:
     return {name: replace(trend, is_own=trend.is_own or alone[name]) for name, trend in found.items()}
 
 
-def _trend(driver: Array, slope: float, sigma: float, tiles: Tiles, is_own: bool) -> Trend:
+def _trend(driver: Array, slope: float, sigma: float, tiles: TileErrors, is_own: bool) -> Trend:
     span = float(np.subtract(*np.quantile(driver, [0.95, 0.05])))
     typical_m = float(np.median(tiles.range_m))
     return Trend(slope=slope, sigma=sigma, effect_m=slope * span, range_m=typical_m, is_own=is_own)
@@ -165,23 +136,24 @@ class _Fit:
     values: Array  # (p,)
     sigmas: Array  # (p,) standard errors
     weights: Array  # (n,) of squared errors
-    scale: float  # of the residuals, in promised sigmas
+    scale: float  # of the residuals, in promised sigmas of a tile alone: what tiles share is no scatter
 
     def slope(self, k: int) -> tuple[float, float]:
         """The k-th value and its standard error."""
         return float(self.values[k]), float(self.sigmas[k])
 
 
-def _robust_fit(tiles: Tiles, drivers: Mapping[str, Array]) -> _Fit:
+def _robust_fit(tiles: TileErrors, drivers: Mapping[str, Array]) -> _Fit:
     """A level and slopes by least squares with Cauchy's loss at the residuals' own scale."""
     A = np.column_stack([np.ones(len(tiles)), *(d - np.median(d) for d in drivers.values())])
     n, p = A.shape
     scaled, errors = A / tiles.sigma_m[:, None], tiles.errors_m / tiles.sigma_m
+    to_alone = tiles.sigma_m / tiles.alone_m
     loss, values, scale = np.ones(n), np.zeros(p), 1.0
     for _ in range(_STEPS):
         root = np.sqrt(loss)
         values = np.linalg.lstsq(scaled * root[:, None], errors * root, rcond=None)[0]
-        residuals = errors - scaled @ values
+        residuals = (errors - scaled @ values) * to_alone
         scale = _MAD_TO_SIGMA * float(np.median(np.abs(residuals))) * math.sqrt(n / max(n - p, 1))
         loss = 1.0 / (1.0 + (residuals / (_CAUCHY * max(scale, _TINY))) ** 2)
     # The noise model is a promise of the least there is: residuals may only widen it.
@@ -196,7 +168,7 @@ def _standard_errors(normal: Array) -> Array:
     return np.sqrt((vectors**2) @ (1.0 / np.maximum(values, _TINY))) / sizes
 
 
-def _cause(tiles: Tiles, fit: _Fit) -> Cause:
+def _cause(tiles: TileErrors, fit: _Fit) -> Cause:
     """Which law the errors follow with range: z (scale), its square (disparity), none (offset), or several."""
     z = tiles.range_m
     weights = fit.weights / max(fit.scale, 1.0) ** 2

@@ -12,16 +12,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aruco.depth_agreement import DepthAgreement, DepthErrors, DepthRow
 from aruco.depth_bias import DepthBias
-from aruco.depth_noise import TEMPORAL_CORRELATION_PX, DepthNoise
+from aruco.depth_noise import DepthNoise
 from aruco.depth_patches import FaceDepth, typical_ratio
-from aruco.depth_trends import Tiles, joined, tiles_of, trends
+from aruco.depth_tiles import face_sigma_m, face_tiles, joined, predicted_inverse
+from aruco.depth_trends import TileErrors, trends
 from aruco.pose_math import Array, Pose, invert_transform
 from aruco.rig_estimate import RigEstimate
 
@@ -63,7 +64,7 @@ def verify_depth(
                 for face in measured
                 if face.frame in rig.T_world_target
             ]
-            found[name] = _agreement(name, measured, compared, known.get(name))
+            found[name] = _agreement(name, measured, compared, camera, known.get(name))
     return found
 
 
@@ -71,10 +72,10 @@ def verify_depth(
 class _Compared:
     """One face that was compared."""
 
-    face: FaceDepth
+    face: FaceDepth  # of what took part, its bias taken out
+    T_cam_target: Pose
     inside: DepthErrors  # pixels
     corners: DepthErrors
-    tiles: Tiles
     rows: tuple[DepthRow, ...]
 
 
@@ -85,12 +86,16 @@ def _compared(face: FaceDepth, T_cam_target: Pose, camera: DepthCamera, bias: De
     if math.isnan(typical_ratio(measured[good], predicted[good])):
         return None
     inside = _errors(measured[good], predicted[good], face, camera)
-    tiles = _tiles(inside, face, face.pixels[good], camera)
     at_corner, beside = face.predicted_corners_m(T_cam_target), _corrected(face.corner_depth_m, bias)
     seen = np.flatnonzero(np.isfinite(beside) & (at_corner > 0))
     corners = _errors(beside[seen], at_corner[seen], face, camera)
-    rows = (_face_row(face, good, inside, tiles), *_corner_rows(face, seen, corners))
-    return _Compared(face=face, inside=inside, corners=corners, tiles=tiles, rows=rows)
+    return _Compared(
+        face=replace(face, pixels=face.pixels[good], measured_m=measured[good], confidence=None),
+        T_cam_target=T_cam_target,
+        inside=inside,
+        corners=corners,
+        rows=(_face_row(face, good, inside, camera), *_corner_rows(face, seen, corners)),
+    )
 
 
 def _corrected(measured_m: Array, bias: DepthBias | None) -> Array:
@@ -102,28 +107,26 @@ def _errors(measured_m: Array, predicted_m: Array, face: FaceDepth, camera: Dept
     return DepthErrors(predicted_m=predicted_m, errors_m=measured_m - predicted_m, sigma_m=sigma_m)
 
 
-def _tiles(inside: DepthErrors, face: FaceDepth, pixels: Array, camera: DepthCamera) -> Tiles:
-    parts = tiles_of(pixels, inside.errors_m)
-    places = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
-    return Tiles(
-        places=np.array([places[part].mean(axis=0) for part in parts]).reshape(-1, 2),
-        range_m=np.array([inside.predicted_m[part].mean() for part in parts]),
-        errors_m=np.array([inside.errors_m[part].mean() for part in parts]),
-        sigma_m=np.array([_tile_sigma_m(inside.predicted_m[part], face, camera.noise) for part in parts]),
+def _tile_errors(compared: Sequence[_Compared], camera: DepthCamera) -> TileErrors:
+    """The errors of all faces, tile by tile; faces in the same part of the image share what is fixed of them."""
+    poses = {c.face.frame: c.T_cam_target for c in compared}
+    frames, T_cam_target = list(poses), list(poses.values())
+    known = (frames, T_cam_target, camera.K, camera.noise)
+    tiles = face_tiles([c.face for c in compared], 0, *known)
+    alone = joined([face_tiles([c.face], 0, *known) for c in compared])
+    range_m = 1.0 / predicted_inverse(tiles, T_cam_target)
+    return TileErrors(
+        places=tiles.ray[:, :2],
+        range_m=range_m,
+        errors_m=1.0 / tiles.inverse - range_m,
+        sigma_m=tiles.sigma * range_m**2,
+        alone_m=alone.sigma * range_m**2,
     )
 
 
-def _tile_sigma_m(predicted_m: Array, face: FaceDepth, noise: DepthNoise) -> float:
-    """Of a tile's mean: what is fixed is shared by all of its pixels, what changes only by neighbours."""
-    z = float(predicted_m.mean())
-    fixed, whole = float(noise.fixed_sigma_m(z)), float(noise.averaged_sigma_m(z, face.n_averaged))
-    changing2 = max(whole**2 - fixed**2, 0.0)
-    return math.sqrt(fixed**2 + changing2 / max(1.0, len(predicted_m) / TEMPORAL_CORRELATION_PX**2))
-
-
-def _face_row(face: FaceDepth, good: NDArray[np.bool_], inside: DepthErrors, tiles: Tiles) -> DepthRow:
+def _face_row(face: FaceDepth, good: NDArray[np.bool_], inside: DepthErrors, camera: DepthCamera) -> DepthRow:
     x_px, y_px = face.pixels[good].mean(axis=0)
-    few, predicted_m = float(np.median(inside.sigma_m)), float(np.median(inside.predicted_m))
+    predicted_m = float(np.median(inside.predicted_m))
     return DepthRow(
         camera=face.camera,
         frame=face.frame,
@@ -135,7 +138,7 @@ def _face_row(face: FaceDepth, good: NDArray[np.bool_], inside: DepthErrors, til
         # Pixel by pixel beside the prediction: on a tilted marker the middle of all depths has another place.
         recorded_m=predicted_m + float(np.median(face.measured_m[good] - inside.predicted_m)),
         error_m=inside.median_m,
-        sigma_m=float(np.sum(tiles.sigma_m**-2.0) ** -0.5) if len(tiles) else few,
+        sigma_m=face_sigma_m(predicted_m, len(inside), face.n_averaged, camera.noise),
         n_pixels=len(inside),
         n_averaged=face.n_averaged,
     )
@@ -162,7 +165,11 @@ def _corner_rows(face: FaceDepth, seen: NDArray[np.int64], corners: DepthErrors)
 
 
 def _agreement(
-    name: str, measured: Sequence[FaceDepth], compared: Sequence[_Compared | None], bias: DepthBias | None
+    name: str,
+    measured: Sequence[FaceDepth],
+    compared: Sequence[_Compared | None],
+    camera: DepthCamera,
+    bias: DepthBias | None,
 ) -> DepthAgreement:
     kept = [c for c in compared if c is not None]
     inside, corners = _together([c.inside for c in kept]), _together([c.corners for c in kept])
@@ -173,7 +180,7 @@ def _agreement(
         corners=corners,
         faces=inside,
         rows=tuple(row for c in kept for row in c.rows),
-        trends=trends(joined([c.tiles for c in kept])),
+        trends=trends(_tile_errors(kept, camera)),
         range_m=(float(near), float(far)),
         n_faces=len(kept),
         n_frames=len({c.face.frame for c in kept}),

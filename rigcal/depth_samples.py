@@ -44,7 +44,10 @@ def face_depths(
         (--still): they are no frames.
     """
     if evidence.config.still:
-        logger.info("depth is not compared with the target: stretches of rest are no frames that have depth")
+        logger.warning(
+            "--verify-depth has nothing to compare with --still: a stretch of rest is no image, so no depth belongs to "
+            "it; depth says nothing about this rig. Verify a recording without --still."
+        )
         return {}
     images = frame_images(evidence)
     found: dict[str, list[FaceDepth]] = {}

@@ -33,7 +33,7 @@ AGREEMENT = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CameraDepth:
+class CameraRatio:
     """What the depth of one camera says."""
 
     ratio: float  # median of measured over predicted depth
@@ -47,7 +47,7 @@ class DepthScale:
 
     scale: float  # share: 0.05 is five percent larger; NaN where cameras contradict each other
     sigma: float  # its standard error, from the differences of cameras, never below what their bias leaves
-    cameras: Mapping[str, CameraDepth]
+    cameras: Mapping[str, CameraRatio]
     odd: tuple[str, ...]  # cameras far off the others, or all when no two agree; not part of ``scale``
 
 
@@ -78,7 +78,7 @@ def depth_scale(
     Returns:
         The scale, or None where no camera has depth or too little of the target is seen in it.
     """
-    cameras: dict[str, CameraDepth] = {}
+    cameras: dict[str, CameraRatio] = {}
     for camera in recording.cameras:
         if camera.name in rig.cameras:
             seen, indices = detections[camera.name], images.get(camera.name, {})
@@ -88,14 +88,14 @@ def depth_scale(
             if len(ratios) >= MIN_SAMPLES_OF_CAMERA:
                 ratio = float(np.median(ratios))
                 spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
-                cameras[camera.name] = CameraDepth(ratio=ratio, spread=spread, n_samples=len(ratios))
+                cameras[camera.name] = CameraRatio(ratio=ratio, spread=spread, n_samples=len(ratios))
                 logger.debug("camera {}: depth is {:.4f} of the map's in {} samples", camera.name, ratio, len(ratios))
     if sum(c.n_samples for c in cameras.values()) < MIN_SAMPLES:
         return None
     return agreed(cameras)
 
 
-def agreed(cameras: Mapping[str, CameraDepth]) -> DepthScale:
+def agreed(cameras: Mapping[str, CameraRatio]) -> DepthScale:
     """What most cameras say. The map is a witness too: it decides between cameras that stand one against one."""
     logs = np.log([c.ratio for c in cameras.values()])
     together = np.abs(logs - logs[:, None]) <= AGREEMENT
@@ -116,7 +116,11 @@ def agreed(cameras: Mapping[str, CameraDepth]) -> DepthScale:
 
 
 def _ratio(face: FaceDepth, camera: Camera, rig: RigEstimate) -> float:
-    """Measured over predicted depth of one marker in one frame; NaN where its pixels show several surfaces."""
+    """Measured over predicted depth of one marker in one frame; NaN where its pixels show several surfaces.
+
+    What the camera itself hardly trusts is left out, as in aruco.depth_verify.
+    """
     K = camera.K if camera.depth_K is None else camera.depth_K
     T_cam_target = invert_transform(rig.cameras[camera.name].T_world_cam) @ rig.T_world_target[face.frame]
-    return typical_ratio(face.measured_m, face.predicted_m(T_cam_target, K))
+    trusted = face.trusted
+    return typical_ratio(face.measured_m[trusted], face.predicted_m(T_cam_target, K)[trusted])

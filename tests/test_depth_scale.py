@@ -21,7 +21,7 @@ from rigcal.config import CalibrateConfig, DetectConfig
 from rigcal.depth_samples import MAX_FRAMES_WITHOUT_DEPTH
 from rigcal.depth_scale import (
     CAMERA_SIGMA,
-    CameraDepth,
+    CameraRatio,
     DepthScale,
     agreed,
     depth_scale,
@@ -291,7 +291,7 @@ def test_few_frames_are_read_those_with_most_markers() -> None:
 
 
 def voted(*ratios: float) -> DepthScale:
-    return agreed({name: CameraDepth(ratio=r, spread=0.001, n_samples=9) for name, r in zip("abcdef", ratios)})
+    return agreed({name: CameraRatio(ratio=r, spread=0.001, n_samples=9) for name, r in zip("abcdef", ratios)})
 
 
 def test_one_camera_is_known_to_its_bias_and_several_better() -> None:

@@ -5,8 +5,8 @@ Leaves    the figures to aruco.depth_verify.
 
 The file has one line a corner and one a face: camera, frame, marker (-1: a whole board), corner (0 to 3; empty for the
 face), x_px and y_px in the depth image, predicted_m from the poses, recorded_m as the camera measured it, error_m after
-a known bias is taken out (positive: too far), sigma_m of the noise model (of one pixel; of a face, of its mean),
-n_pixels of a face that took part, n_averaged depth images that were pooled.
+a known bias is taken out (positive: too far; of a face, the median of its pixels), sigma_m the standard deviation of
+error_m that the noise model promises, n_pixels of a face that took part, n_averaged depth images that were pooled.
 """
 
 from __future__ import annotations
