@@ -95,7 +95,7 @@ class CalibrateOutputs:
             show_depth(out, self.corrected, corrected=True)
         tell(calibration, self.poses)
         for path, what in (
-            (self.depth, "the pooled depth of every camera"),
+            (self.depth, f"the pooled depth of {len(self.pooled)} cameras"),
             (self.report, "every compared corner and face"),
         ):
             if path is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 
@@ -35,12 +35,18 @@ def require_depth(recording: Recording) -> None:
             "The recording has no depth images, which --save-depth and --verify-depth read: they belong in "
             "<camera>/depth/<stamp_ns>.png or .npy; record them, or leave these options out."
         )
+    unreadable: list[str] = []
     for camera in cameras:
         check_name(camera.name, "the recording")
-        first = next(_depth_frames(recording, camera, recording.depth_indices(camera.name).tolist()), None)
+        read = _Reading(recording, camera, recording.depth_indices(camera.name).tolist())
+        first = next(iter(read), None)
         if first is not None:
             where = f"camera {camera.name}: depth"
             check_camera(camera_depth(pool_depth([first], where=where), K=camera.K_depth), where)
+        else:
+            unreadable.append(f"camera {camera.name}: {read.trouble}")
+    if len(unreadable) == len(cameras):
+        raise InputError(f"No depth image of the recording can be used. {'; '.join(unreadable)}.")
 
 
 def pool_recording(
@@ -61,15 +67,24 @@ def pool_recording(
     counter = _Counter(progress, sum(map(len, chosen.values())))
 
     def pooled(camera: Camera) -> CameraDepth | None:
-        frames = _depth_frames(recording, camera, chosen[camera.name], counter)
+        reading = _Reading(recording, camera, chosen[camera.name], counter.tick)
+        frames = iter(reading)
         first = next(frames, None)
         if first is None:
-            logger.warning("camera {}: no depth that can be read, so depth says nothing about it", camera.name)
+            logger.warning("camera {}: {}; so depth says nothing about it", camera.name, reading.trouble)
             return None
         found = pool_depth(chain([first], frames), where=f"camera {camera.name}: depth")
+        if reading.trouble:
+            logger.warning("camera {}: {}", camera.name, reading.trouble)
         if not found.count.any():
             logger.warning("camera {}: its depth images agree nowhere, as if it had been moved: left out", camera.name)
             return None
+        if baseline_m is not None and camera.baseline_m not in (None, baseline_m):
+            logger.warning(
+                "camera {}: its recording says that its baseline is {:g} m, which counts for more than --baseline",
+                camera.name,
+                camera.baseline_m,
+            )
         return camera_depth(found, K=camera.K_depth, baseline_m=camera.baseline_m or baseline_m)
 
     # Each camera holds its images until they are pooled: two at a time keep memory flat.
@@ -88,16 +103,39 @@ def _spread(indices: Sequence[int]) -> list[int]:
     return [indices[k] for k in spread_indices(len(indices))]
 
 
-def _depth_frames(
-    recording: Recording, camera: Camera, indices: Sequence[int], counter: _Counter | None = None
-) -> Iterator[DepthFrame]:
-    for frame in recording.frames(camera.name, indices, depth=True):
-        if counter is not None:
-            counter.tick()
-        if isinstance(frame, BadFrame):
-            logger.debug("camera {}: depth left out: {}", camera.name, frame.reason)
-        elif frame.depth_m is not None and np.isfinite(frame.depth_m).any():
-            yield frame.stamp_ns, frame.depth_m, frame.confidence
+class _Reading:
+    """The usable depth images of one camera, one at a time, and what became of the others."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        camera: Camera,
+        indices: Sequence[int],
+        tick: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._frames = recording.frames(camera.name, indices, depth=True)
+        self._n, self._tick = len(indices), tick
+        self._bad: list[str] = []
+        self._empty = 0
+
+    def __iter__(self) -> Iterator[DepthFrame]:
+        for frame in self._frames:
+            self._tick()
+            if isinstance(frame, BadFrame):
+                self._bad.append(frame.reason)
+            elif frame.depth_m is None or not np.isfinite(frame.depth_m).any():
+                self._empty += 1
+            else:
+                yield frame.stamp_ns, frame.depth_m, frame.confidence
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong, in words; empty if nothing is."""
+        if not self._n:
+            return "no depth images"
+        told = [f"{len(self._bad)} of {self._n} cannot be read ({self._bad[0]})"] if self._bad else []
+        told += [f"{self._empty} of {self._n} hold no measurement"] if self._empty else []
+        return "of its depth images " + ", and ".join(told) if told else ""
 
 
 class _Counter:

@@ -45,8 +45,8 @@ def face_depths(
     """
     if evidence.config.still:
         logger.warning(
-            "--verify-depth has nothing to compare with --still: a stretch of rest is no image, so no depth belongs to "
-            "it; depth says nothing about this rig. Verify a recording without --still."
+            "--verify-depth has nothing to compare with --still: a stretch of rest is no single image, so no depth "
+            "image belongs to it, and depth on the target is left out; run without --still to compare it."
         )
         return {}
     images = frame_images(evidence)
