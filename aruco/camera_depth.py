@@ -22,7 +22,13 @@ from aruco.pose_math import Array
 # The principal point lies near the middle: where it is farther off (share of the image), intrinsics are those of
 # another resolution. Half and twice the resolution put it at a quarter and at the whole.
 MAX_OFF_CENTRE = 0.2
+# Focal lengths over the longer side of the image: fields of view from half a degree to 178.
+FOCAL_SHARES = (0.01, 100.0)
+WORST_CONFIDENCE = 100
+# So many measurements of a pixel can be counted in 16 bits, and no more images can have been pooled.
+MAX_POOLED = np.iinfo(np.uint16).max
 _MAX_NAME = 200
+_INT64 = np.iinfo(np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,15 +48,18 @@ class CameraDepth:
         """Check that everything has the size of the depth, and the intrinsics; InputError says what does not."""
         if np.ndim(self.depth) != 2:
             raise InputError(f"depth must be an image (H, W), got shape {np.shape(self.depth)}.")
-        object.__setattr__(self, "depth", np.asarray(self.depth, dtype=np.float32))
+        with np.errstate(over="ignore"):  # beyond single precision nothing is a depth; infinite is a hole
+            object.__setattr__(self, "depth", np.asarray(self.depth, dtype=np.float32))
         images = {"confidence": self.confidence, "spread": self.spread, "count": self.count}
         images |= {f"frame {stamp}": frame.depth for stamp, frame in self.frames.items()}
         for name, image in images.items():
             if image is not None and np.shape(image) != self.depth.shape:
                 raise InputError(f"{name} of shape {np.shape(image)} beside depth of {self.depth.shape}.")
+        object.__setattr__(self, "confidence", _counted("confidence", self.confidence, WORST_CONFIDENCE, np.uint8))
+        object.__setattr__(self, "count", _counted("count", self.count, MAX_POOLED, np.uint16))
         object.__setattr__(self, "K", _checked_intrinsics(self.K))
-        if self.n_frames < 1:
-            raise InputError(f"n_frames must be positive, got {self.n_frames}.")
+        if not 1 <= self.n_frames <= MAX_POOLED:
+            raise InputError(f"n_frames must be positive and at most {MAX_POOLED}, got {self.n_frames}.")
         if self.baseline_m is not None and not (math.isfinite(self.baseline_m) and self.baseline_m > 0):
             raise InputError(f"baseline must be positive metres, got {self.baseline_m}.")
 
@@ -105,18 +114,43 @@ def check_camera(camera: CameraDepth, where: str) -> None:
     """Find out whether a camera's depth can be worked with.
 
     Raises:
-        InputError: The depth is none (see depth_image.check_depth), or the intrinsics are those of another size.
+        InputError: The depth is none (see depth_image.check_depth), a kept frame has no stamp or score that can be
+            one, or the intrinsics are those of another size.
     """
     check_depth(camera.depth, where)
     for stamp, frame in camera.frames.items():
         with_holes(frame.depth, f"{where}, frame {stamp}")
+        if not _INT64.min <= stamp <= _INT64.max:
+            raise InputError(
+                f"{where}, frame {stamp}: this is no stamp in ns of 64 bits; check the recording's stamps."
+            )
+        if not 0.0 <= frame.score <= 1.0:
+            raise InputError(f"{where}, frame {stamp}: score must be from 0 to 1, got {frame.score}; pool it again.")
     size = np.array(camera.depth.shape[::-1])
+    shares = np.diag(camera.K)[:2] / size.max()
+    if shares.min() < FOCAL_SHARES[0] or shares.max() > FOCAL_SHARES[1] or abs(camera.K[0, 1]) > camera.K[0, 0]:
+        raise InputError(
+            f"{where}: intrinsics with focal lengths of {camera.K[0, 0]:.4g} and {camera.K[1, 1]:.4g} pixels and skew "
+            f"{camera.K[0, 1]:.4g} are no camera of {size[0]} x {size[1]} pixels; give those of the depth image."
+        )
     centre = camera.K[:2, 2]
     if (np.abs((centre + 0.5) / size - 0.5) > MAX_OFF_CENTRE).any():
         raise InputError(
             f"{where}: intrinsics with the principal point at ({centre[0]:.0f}, {centre[1]:.0f}) do not fit depth of "
             f"{size[0]} x {size[1]} pixels; give those of the depth image's resolution."
         )
+
+
+def _counted(
+    name: str, image: Any, most: int, kind: type[np.unsignedinteger[Any]]
+) -> NDArray[np.unsignedinteger[Any]] | None:
+    """An image of whole numbers from 0 to ``most`` in its own type; a cast would let others wrap around."""
+    if image is None:
+        return None
+    given = np.asarray(image)
+    if given.dtype.kind not in "ui" or (given.size and (given.min() < 0 or given.max() > most)):
+        raise InputError(f"{name} must hold whole numbers from 0 to {most} ({np.dtype(kind)}).")
+    return given.astype(kind, copy=False)
 
 
 def _checked_intrinsics(K: Any) -> Array:

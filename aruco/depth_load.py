@@ -9,7 +9,8 @@ Sizes are checked before anything is read, and only data inside the file are: HD
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aruco.camera_depth import CameraDepth, check_camera, check_name
+from aruco.depth_image import Depth, check_depth, with_holes
 from aruco.depth_pool import KeptFrame
 from aruco.errors import InputError, RigError
 
@@ -28,6 +30,7 @@ MAX_BYTES = 4 * 2**30
 MAX_CHUNK_BYTES = 2**28
 MAX_CAMERAS = 1000
 MAX_KEPT = 1000
+_STAMP = re.compile(r"-?[0-9]{1,19}", re.ASCII)
 
 
 def load_depth_data(path: Path, *, frames: bool = True) -> dict[str, CameraDepth]:
@@ -109,7 +112,7 @@ def _read_camera(group: Any, where: str, *, with_frames: bool) -> CameraDepth:
     }
     try:
         camera = CameraDepth(
-            depth=_array(group, "depth", size, where, np.float32),
+            depth=_depth(group, size, where, check_depth),
             K=_array(group, "intrinsics", (3, 3), where, np.float64),
             n_frames=_whole(group, "n_frames", where),
             baseline_m=_number(group, "baseline", where) if "baseline" in group.attrs else None,
@@ -125,13 +128,15 @@ def _read_camera(group: Any, where: str, *, with_frames: bool) -> CameraDepth:
 
 def _kept(group: Any, size: tuple[int, int], where: str) -> Mapping[int, KeptFrame]:
     frames = _group(group, "frames", where)
-    if len(frames) > MAX_KEPT or not all(name.isascii() and name.isdigit() and len(name) < 20 for name in frames):
+    if len(frames) > MAX_KEPT or not all(_STAMP.fullmatch(name) for name in frames):
         raise InputError(f"{where}: frames must be at most {MAX_KEPT} groups named by stamps in ns; write it again.")
+    if len({int(name) for name in frames}) < len(frames):
+        raise InputError(f"{where}: frames hold the same stamp twice, written in two ways; write it again.")
     kept: dict[int, KeptFrame] = {}
     for name in sorted(frames, key=int):
         frame = _group(frames, name, where)
         score = _number(frame, "score", f"{where}, frame {name}")
-        depth = _array(frame, "depth", size, f"{where}, frame {name}", np.float32)
+        depth = _depth(frame, size, f"{where}, frame {name}", with_holes)
         kept[int(name)] = KeptFrame(depth=depth, score=score)
     return kept
 
@@ -176,17 +181,28 @@ def _group(group: Any, name: str, where: str) -> Any:
     return found
 
 
+def _depth(group: Any, size: tuple[int, int], where: str, checked: Callable[[Any, str], Depth]) -> NDArray[np.float32]:
+    """Depth with NaN for holes, whatever a file marks them with."""
+    return np.asarray(checked(_array(group, "depth", size, where, np.float32), where), dtype=np.float32)
+
+
 def _array(group: Any, name: str, shape: tuple[int, int], where: str, kind: type[np.number[Any]]) -> NDArray[Any]:
-    """The numbers of a dataset that has the size wanted, and whole numbers where those are wanted."""
+    """The numbers of a dataset that has the size wanted; whole numbers must have the type wanted, or they wrap."""
     import h5py
 
     found = _own(group, name, where)
-    kinds = "ui" if issubclass(kind, np.integer) else "fiu"
-    if not isinstance(found, h5py.Dataset) or found.dtype.kind not in kinds:
+    if not isinstance(found, h5py.Dataset) or not _fits(found.dtype, np.dtype(kind)):
         raise InputError(f"{where}: {name} does not hold {np.dtype(kind)}; write the store again.")
     if found.shape != shape:
         raise InputError(f"{where}: {name} has shape {found.shape}, not {shape}; write the store again.")
     chunk_bytes = math.prod(found.chunks or shape) * found.dtype.itemsize
     if found.external or found.is_virtual or chunk_bytes > MAX_CHUNK_BYTES:
         raise InputError(f"{where}: {name} is kept in a way that no depth store is; write the store again.")
-    return np.asarray(found[()]).astype(kind, copy=False)
+    with np.errstate(over="ignore"):  # beyond single precision nothing is a depth; infinite is a hole
+        return np.asarray(found[()]).astype(kind, copy=False)
+
+
+def _fits(given: np.dtype[Any], wanted: np.dtype[Any]) -> bool:
+    if wanted.kind == "u":
+        return given.kind == "u" and given.itemsize == wanted.itemsize  # in either order of bytes
+    return given.kind in "fiu"

@@ -36,7 +36,7 @@ def save_depth_data(path: Path, cameras: Mapping[str, CameraDepth]) -> None:
         cameras: By name. The packed file is held in memory: about 10 MB a 720p camera with five kept frames.
 
     Raises:
-        InputError: No camera, a name that cannot be one, or depth that is none.
+        InputError: No camera, a name that cannot be one, depth that is none, or anything that could not be read again.
         OutputError: The file cannot be written.
     """
     import h5py  # late: only this and reading a store need it
@@ -62,11 +62,11 @@ def _write_camera(group: Any, camera: CameraDepth, where: str) -> None:
     group.create_dataset("intrinsics", data=camera.K, track_times=False)
     _write_image(group, "depth", with_holes(camera.depth, where).astype(np.float32))
     if camera.confidence is not None:
-        _write_image(group, "confidence", np.asarray(camera.confidence, dtype=np.uint8))
+        _write_image(group, "confidence", camera.confidence)
     if camera.spread is not None:
         _write_image(group, "spread", np.asarray(camera.spread, dtype=np.float32))
     if camera.count is not None:
-        _write_image(group, "count", np.asarray(camera.count, dtype=np.uint16))
+        _write_image(group, "count", camera.count)
     for stamp in sorted(camera.frames):
         frame = group.create_group(f"frames/{stamp}")
         frame.attrs["score"] = float(camera.frames[stamp].score)

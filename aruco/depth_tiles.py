@@ -295,10 +295,10 @@ def tile_sigma(
         n_averaged: Depth images that were pooled.
         uneven_m: How flat the surface is [m].
     """
-    z, area, uneven = (np.asarray(x, dtype=np.float64) for x in (depth_m, area_px, uneven_m))
+    z, area, shared, uneven = (np.asarray(x, dtype=np.float64) for x in (depth_m, area_px, sharing, uneven_m))
     fixed2 = noise.fixed_sigma_m(z) ** 2
     changing2 = np.maximum(noise.averaged_sigma_m(z, n_averaged) ** 2 - fixed2, 0.0)
-    variance = (fixed2 + uneven**2) * sharing + changing2 * np.minimum(TEMPORAL_CORRELATION_PX**2 / area, 1.0)
+    variance = (fixed2 + uneven**2) * shared + changing2 * np.minimum(TEMPORAL_CORRELATION_PX**2 / area, 1.0)
     return np.sqrt(variance) / z**2
 
 

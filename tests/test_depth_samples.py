@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 from depth_boards import CAMERA, MARKER, plane_depth, pose
+from loguru import logger
 from numpy.typing import NDArray
 from target_views import sight
 
@@ -227,9 +228,18 @@ def test_cameras_without_depth_or_pose_measure_nothing(resting: tuple[Evidence, 
     assert face_depths(without, fewer).keys() == rig.cameras.keys() - {blind, lost}
 
 
-def test_stretches_of_rest_have_no_depth(resting: tuple[Evidence, RigEstimate]) -> None:
+def test_stretches_of_rest_have_no_depth_and_it_is_said(resting: tuple[Evidence, RigEstimate]) -> None:
     evidence, rig = resting
-    assert face_depths(replace(evidence, config=replace(evidence.config, still=True)), rig) == {}
+    lines: list[str] = []
+    sink = logger.add(lambda message: lines.append(str(message)), level="WARNING", format="{message}")
+    try:
+        assert face_depths(replace(evidence, config=replace(evidence.config, still=True)), rig) == {}
+        assert len(lines) == 1
+        assert "--verify-depth has nothing to compare with --still" in lines[0]
+        face_depths(evidence, rig)
+    finally:
+        logger.remove(sink)
+    assert len(lines) == 1
 
 
 def test_noise_goes_by_the_baseline_that_is_known(resting: tuple[Evidence, RigEstimate]) -> None:

@@ -138,6 +138,12 @@ def test_names_that_lead_elsewhere_are_refused(name: str, tmp_path: Path) -> Non
         ({"K": np.full((3, 3), np.nan)}, "NaN"),
         ({"K": -K}, "no camera matrix"),
         ({"n_frames": 0}, "n_frames"),
+        ({"n_frames": 10**15}, "n_frames"),
+        ({"confidence": np.full(SIZE, 300)}, "confidence must hold whole numbers from 0 to 100"),
+        ({"confidence": np.full(SIZE, 101, dtype=np.uint8)}, "from 0 to 100"),
+        ({"confidence": np.full(SIZE, 0.5)}, "from 0 to 100"),
+        ({"count": np.full(SIZE, -1)}, "count must hold whole numbers from 0 to 65535"),
+        ({"count": np.full(SIZE, 2**16)}, "from 0 to 65535"),
         ({"baseline_m": -0.1}, "baseline"),
         ({"baseline_m": np.nan}, "baseline"),
     ],
@@ -152,6 +158,58 @@ def test_intrinsics_of_another_resolution_are_refused(factor: float, tmp_path: P
     scaled = K * [[factor], [factor], [1.0]]
     with pytest.raises(InputError, match=r"camera a: .*do not fit depth of 40 x 30"):
         save_depth_data(tmp_path / "x.h5", {"a": CameraDepth(depth=_depth(), K=scaled)})
+
+
+@pytest.mark.parametrize(
+    "wild",
+    [
+        np.array([[1e300, 0, 19.5], [0, 35, 14.5], [0, 0, 1]]),
+        np.array([[35, 0, 19.5], [0, 1e-300, 14.5], [0, 0, 1]]),
+        np.array([[35, 1e4, 19.5], [0, 35, 14.5], [0, 0, 1]]),
+    ],
+)
+def test_focal_lengths_of_no_camera_are_refused(wild: np.ndarray, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"camera a: intrinsics with focal lengths .* no camera of 40 x 30 pixels"):
+        save_depth_data(tmp_path / "x.h5", {"a": CameraDepth(depth=_depth(), K=wild)})
+
+
+def _with_frames(frames: dict[int, KeptFrame]) -> CameraDepth:
+    return CameraDepth(depth=_depth(), K=K, frames=frames)
+
+
+def test_stamps_before_the_beginning_of_time_are_kept(tmp_path: Path) -> None:
+    frames = {stamp: KeptFrame(depth=_depth(), score=0.5) for stamp in (-(2**63), -5, 0, 5, 2**63 - 1)}
+    save_depth_data(tmp_path / "x.h5", {"a": _with_frames(frames)})
+    _same(load_depth_data(tmp_path / "x.h5")["a"], _with_frames(frames))
+
+
+@pytest.mark.parametrize(
+    ("stamp", "score", "says"),
+    [
+        (5, np.nan, "score must be from 0 to 1, got nan"),
+        (5, np.inf, "score"),
+        (5, -0.1, "score"),
+        (5, 1.5, "score"),
+        (2**63, 1.0, "no stamp in ns"),
+        (-(10**20), 1.0, "no stamp in ns"),
+    ],
+)
+def test_what_could_not_be_read_again_is_not_written(stamp: int, score: float, says: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"camera a, frame {stamp}: .*{says}"):
+        save_depth_data(tmp_path / "x.h5", {"a": _with_frames({stamp: KeptFrame(depth=_depth(), score=score)})})
+    assert not list(tmp_path.iterdir())
+
+
+def test_holes_are_nan_whatever_the_file_marks_them_with(store: Path) -> None:
+    holes = _depth().astype(np.float64)
+    holes[0, :4] = [0.0, np.inf, 1e300, np.nan]
+    with h5py.File(store, "r+") as file:
+        del file["cameras/left/depth"]
+        file.create_dataset("cameras/left/depth", data=holes)
+    read = load_depth_data(store)["left"].depth
+    assert read.dtype == np.float32
+    assert np.isnan(read[0, :4]).all()
+    assert np.isfinite(read).any()
 
 
 def _set(path: str, key: str, value: Any) -> Callable[[Any], None]:
@@ -176,6 +234,18 @@ def _link(path: str, link: Any) -> Callable[[Any], None]:
 
 
 LEFT = "cameras/left"
+
+
+def _twice(stamp: int, otherwise: str) -> Callable[[Any], None]:
+    """One stamp, written in two ways."""
+
+    def change(file: Any) -> None:
+        for name in (str(stamp), otherwise):
+            frame = file.create_group(f"{LEFT}/frames/{name}")
+            frame.attrs["score"] = 1.0
+            frame["depth"] = _depth()
+
+    return change
 
 
 @pytest.mark.parametrize(
@@ -213,6 +283,16 @@ LEFT = "cameras/left"
         (_put(f"{LEFT}/depth", shape=(2**20, 2**20), dtype="f4", chunks=(64, 64)), "shape"),
         (_put(f"{LEFT}/depth", shape=SIZE, dtype="f4", external=[("/etc/hostname", 0, 4800)]), "kept in a way"),
         (_put(f"{LEFT}/confidence", data=np.full(SIZE, np.nan)), "confidence does not hold uint8"),
+        (_put(f"{LEFT}/confidence", data=np.full(SIZE, 300)), "confidence does not hold uint8"),
+        (_put(f"{LEFT}/confidence", data=np.full(SIZE, 101, dtype="u1")), "left: confidence must hold .* 0 to 100"),
+        (_put(f"{LEFT}/count", data=np.full(SIZE, -1)), "count does not hold uint16"),
+        (_set(LEFT, "n_frames", 10**15), "left: n_frames"),
+        (_put(f"{LEFT}/depth", data=np.full(SIZE, 1e300)), "infinite everywhere"),
+        (_put(f"{LEFT}/intrinsics", data=K * [[1e298], [1], [1]]), "focal lengths"),
+        (_twice(17, "017"), "same stamp twice"),
+        (_twice(0, "-0"), "same stamp twice"),
+        (lambda file: file.create_group(f"{LEFT}/frames/--5"), "stamps"),
+        (lambda file: file.create_group(f"{LEFT}/frames/+5"), "stamps"),
         (_put(f"{LEFT}/spread", data=np.zeros((3, 3), dtype="f4")), "spread has shape"),
         (_link(f"{LEFT}/depth", h5py.ExternalLink("other.h5", "/x")), "of its own"),
         (_link(f"{LEFT}/depth", h5py.SoftLink("/cameras/41182735/depth")), "of its own"),

@@ -205,6 +205,21 @@ def test_a_camera_of_another_depth_scale_is_named_and_not_believed(demo_known: K
     assert abs(np.mean([c.ratio for c in found.cameras.values()]) - 1) > SCALE_TOLERANCE
 
 
+def test_what_a_camera_does_not_trust_is_not_asked(demo_known: Known) -> None:
+    def spoil(frame: Frame, confidence: int) -> Frame:
+        assert frame.depth_m is not None
+        depth_m, doubt = frame.depth_m.copy(), np.zeros(frame.depth_m.shape, dtype=np.uint8)
+        for k in (0, 1, 2):
+            depth_m[k::5] *= np.float32(1.04)
+            doubt[k::5] = confidence
+        return replace(frame, depth_m=depth_m, confidence=doubt)
+
+    found = demo_known.changed(lambda frame: spoil(frame, 100)).scale()
+    assert abs(found.scale) < SCALE_TOLERANCE
+    # It bites: where the camera says nothing of them, they are the majority.
+    assert demo_known.changed(lambda frame: spoil(frame, 0)).scale().scale > 2 * SCALE_TOLERANCE
+
+
 def test_something_before_a_fifth_of_a_marker_does_not_disturb(demo_known: Known) -> None:
     def hide(frame: Frame) -> Frame:
         assert frame.depth_m is not None

@@ -16,12 +16,14 @@ from rich.console import Console
 
 from aruco.depth_bias import DepthBias
 from aruco.depth_patches import FaceDepth
-from aruco.depth_trends import SIGNIFICANT, Tiles, Trends, tiles_of, trends
+from aruco.depth_tiles import face_tiles
+from aruco.depth_trends import SIGNIFICANT, TileErrors, Trends, trends
 from aruco.depth_verify import DepthAgreement, verify_depth
 from aruco.errors import OutputError
 from aruco.pose_math import Array, Pose, exp_se3
 from rigcal.report.depth_table import HEADER, csv_rows, show_depth, write_report
 from rigcal.sim.noise import DepthBias as SimulatedBias
+from rigcal.sim.noise import DepthNoise as SimulatedNoise
 
 POSES = [pose(place, about_rad=k) for k, place in enumerate(PLACES)]
 
@@ -146,20 +148,33 @@ def test_noise_alone_is_no_trend() -> None:
 def test_range_and_place_that_go_together_are_not_told_apart() -> None:
     # Every marker that is farther is seen higher, as on a floor.
     floor = [pose((0.0, 0.9 - 0.25 * z, z), tilt_deg=0.0) for z in np.linspace(1.5, 2.5, 6)]
-    bent = [replace(f, measured_m=f.measured_m + 0.02 * (f.measured_m - 2.0)) for f in shown(floor, EXACT)]
-    found = verified(bent, floor)
+
+    def bent(slope: float) -> DepthAgreement:
+        faces = shown(floor, EXACT)
+        return verified([replace(f, measured_m=f.measured_m + slope * (f.measured_m - 2.0)) for f in faces], floor)
+
+    found = bent(0.02)
     assert found.trends is not None
     assert {"range", "down"} <= significant(found)
-    assert found.trends.slopes["range"].is_own  # without noise its law fits to the bit, the other does not
+    assert not found.trends.slopes["range"].is_own
+    assert "which went together" in found.judgement
+    # A law that is far larger than noise fits, and the other does not.
+    clear = bent(0.2).trends
+    assert clear is not None
+    assert clear.slopes["range"].is_own
 
 
-def lattice() -> Tiles:
+def lattice() -> TileErrors:
     x, y, z = (g.ravel() for g in np.meshgrid([-0.4, 0.0, 0.4], [-0.3, 0.1, 0.3], [1.5, 2.0, 3.0]))
     n = len(x)
-    return Tiles(places=np.stack([x, y], axis=1), range_m=z, errors_m=np.zeros(n), sigma_m=np.full(n, 0.004))
+    return of_tiles(np.stack([x, y], axis=1), z, np.zeros(n), np.full(n, 0.004))
 
 
-def of(tiles: Tiles, errors_m: Array) -> Trends:
+def of_tiles(places: Array, range_m: Array, errors_m: Array, sigma_m: Array) -> TileErrors:
+    return TileErrors(places=places, range_m=range_m, errors_m=errors_m, sigma_m=sigma_m, alone_m=sigma_m)
+
+
+def of(tiles: TileErrors, errors_m: Array) -> Trends:
     found = trends(replace(tiles, errors_m=errors_m))
     assert found is not None
     return found
@@ -191,24 +206,74 @@ def test_standard_errors_are_honest() -> None:
 
 def test_few_tiles_make_no_trend() -> None:
     tiles = lattice()
-    few = Tiles(places=tiles.places[:2], range_m=tiles.range_m[:2], errors_m=np.ones(2), sigma_m=np.ones(2))
+    few = of_tiles(tiles.places[:2], tiles.range_m[:2], np.ones(2), np.ones(2))
     assert trends(few) is None
-    some = Tiles(places=tiles.places[:6], range_m=tiles.range_m[:6], errors_m=np.ones(6), sigma_m=np.ones(6))
+    some = of_tiles(tiles.places[:6], tiles.range_m[:6], np.ones(6), np.ones(6))
     level = trends(some)
     assert level is not None
     assert level.level_m == pytest.approx(1.0)
     assert level.slopes == {}
 
 
-def test_tiles_hold_every_sound_pixel_once() -> None:
-    columns, rows = (g.ravel() for g in np.meshgrid(np.arange(100), np.arange(60)))
-    errors = np.random.default_rng(0).normal(0, 0.01, len(columns))
-    errors[::50] = 1.0
-    parts = tiles_of(np.stack([columns, rows], axis=1).astype(float), errors)
-    used = np.concatenate(parts)
-    assert len(np.unique(used)) == len(used)
-    assert not errors[used].max() > 0.1
-    assert len(used) > 0.95 * len(errors)
+# A board of 45 cm that is waved in one place: a tenth of the image, in twelve frames.
+WAVED = [pose((0.02 * (-1) ** k, 0.01, 1.8 + 0.05 * k), tilt_deg=25.0, about_rad=k / 2) for k in range(12)]
+# Nothing but what is the same in all frames, and rough enough to be there in 20 recordings.
+FIXED_ONLY = SimulatedNoise(sigma_px=0.0, fixed_sigma_px=0.06, dropout=0.0)
+
+
+def levels_in_sigmas(errors: Callable[[TileErrors], TileErrors], monkeypatch: pytest.MonkeyPatch) -> Array:
+    """The level of the errors of 20 recordings of the waved board, in its standard errors."""
+    monkeypatch.setattr("aruco.depth_verify.trends", lambda tiles: trends(errors(tiles)))
+    found = [verified(shown(WAVED, FIXED_ONLY, seed=seed), WAVED).trends for seed in range(20)]
+    return np.array([t.level_m / t.level_sigma_m for t in found if t is not None])
+
+
+def test_frames_of_one_part_of_the_image_are_not_independent(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = levels_in_sigmas(lambda tiles: tiles, monkeypatch)
+    # 20 draws know a root mean square to a sixth; three of those, and corners of the board that wander.
+    assert 0.4 < np.sqrt(np.mean(levels**2)) < 1.5
+    # It bites: as if each frame had fixed errors of its own, it is more than twice what is promised.
+    naive = levels_in_sigmas(lambda tiles: replace(tiles, sigma_m=tiles.alone_m), monkeypatch)
+    assert np.sqrt(np.mean(naive**2)) > 2.0
+
+
+def test_a_resting_face_is_not_doubted_and_scatter_is_that_of_tiles_alone() -> None:
+    faces = shown(WAVED, FIXED_ONLY)
+    known = (range(len(WAVED)), WAVED, KNOWN["a"].K, KNOWN["a"].noise)
+    one = face_tiles(faces[:1], 0, *known)
+    many = face_tiles(faces, 0, *known)
+    # The first frame's tiles come first; the middle of the board is there in all twelve frames.
+    growth = (many.sigma[: len(one)] / one.sigma) ** 2
+    assert growth.max() > 4
+    assert growth.min() >= 1.0 - 1e-9
+    # Faces in different parts of the image share nothing.
+    apart = face_tiles(shown(POSES[:4], FIXED_ONLY), 0, range(4), POSES[:4], *known[2:])
+    alone = [face_tiles([f], 0, range(4), POSES[:4], *known[2:]) for f in shown(POSES[:4], FIXED_ONLY)]
+    np.testing.assert_allclose(apart.sigma, np.concatenate([a.sigma for a in alone]))
+    found = verified(shown(WAVED, NOISY), WAVED)
+    assert found.trends is not None
+    # Sixty full tiles, of noise as promised; in sigmas that know of sharing it would be below a half.
+    assert 0.6 < found.trends.scatter < 1.4
+
+
+def test_part_of_a_tile_weighs_less_than_a_whole_one() -> None:
+    (face,) = shown([pose((0.0, 0.0, 1.8), tilt_deg=0.0)], FIXED_ONLY)
+    T = [pose((0.0, 0.0, 1.8), tilt_deg=0.0)]
+    sides = np.ptp(face.pixels, axis=0) + 1
+    noise = replace(KNOWN["a"].noise, sigma_px=0.0, floor_m=0.0)
+    tiles = face_tiles([face], 0, [0], T, KNOWN["a"].K, noise)
+    # What all tiles know together is what the area knows: rims make no measurements of their own.
+    fixed = 0.06 / FOCAL_BASELINE * 28 / np.sqrt(sides.prod())
+    # A millimetre of unevenness beside 3 mm of fixed errors: a twentieth.
+    assert np.sum(tiles.sigma**-2.0) ** -0.5 == pytest.approx(fixed, rel=0.15)
+    assert tiles.sigma.max() > 1.5 * tiles.sigma.min()
+
+
+def test_sigma_of_a_face_is_that_of_its_error() -> None:
+    rows = [row for seed in range(6) for row in verified(shown(POSES, NOISY, seed=seed)).rows if row.corner is None]
+    ratio = np.array([row.error_m / row.sigma_m for row in rows])
+    # 72 faces know it to a twelfth; three of those.
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.25)
 
 
 # --- what is left out -----------------------------------------------------------------------------------------------
