@@ -141,7 +141,7 @@ def fuse(
     for _ in range(MAX_STEPS):
         e, J = problem.rows(at)
         if scale is None:
-            said = robust_scale(e / tiles.sigma)
+            said = robust_scale(e / tiles.alone)
         w = _weights(e, tiles.sigma * said)
         A, b = problem.normal(at, e, J, w)
         step = np.zeros(len(free))

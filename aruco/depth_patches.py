@@ -127,7 +127,7 @@ def _patch(marker: int, corners: Array, in_depth: Array, hull: Array) -> Patch:
 
 def _in_depth_image(camera: Camera, pixels: Array) -> Array:
     """Recorded pixels (n, 2) in the depth image, which has no distortion and may have intrinsics of its own."""
-    K = camera.K if camera.depth_K is None else camera.depth_K
+    K = camera.K_depth
     return lens.undistort(camera, pixels) @ K[:2, :2].T + K[:2, 2]
 
 

@@ -51,7 +51,8 @@ class Tiles:
     offset_m: Array  # (n,) normal . X of the surface
     ray: Array  # (n, 3) mean of (x, y, 1)
     inverse: Array  # (n,) mean of 1 / measured depth [1/m]
-    sigma: Array  # (n,) its standard deviation [1/m], without the camera's bias
+    sigma: Array  # (n,) its standard deviation [1/m], without the camera's bias; makes the mean over all tiles right
+    alone: Array  # (n,) that of a tile by itself, which its residual is to be compared with; at most sigma
     block: NDArray[np.int64]  # (n,) which part of the image it lies in, for tests on what was not used
 
     def __len__(self) -> int:
@@ -80,6 +81,7 @@ def _nothing() -> Tiles:
         ray=vector,
         inverse=number,
         sigma=number,
+        alone=number,
         block=index,
     )
 
@@ -241,6 +243,7 @@ def _as_tiles(found: Sequence[tuple[_Surface, _Squares]], noise: DepthNoise) -> 
     )
     sharing = _sharing(cell, target, area_px)
     block = cell // (BLOCK_PX // TILE_PX)
+    model = {"n_averaged": n_averaged, "uneven_m": uneven_m}
     return Tiles(
         camera=camera,
         target=target,
@@ -248,7 +251,8 @@ def _as_tiles(found: Sequence[tuple[_Surface, _Squares]], noise: DepthNoise) -> 
         offset_m=offset_m,
         ray=ray,
         inverse=inverse,
-        sigma=tile_sigma(1.0 / inverse, area_px, sharing, noise, n_averaged=n_averaged, uneven_m=uneven_m),
+        sigma=tile_sigma(1.0 / inverse, area_px, sharing, noise, **model),
+        alone=tile_sigma(1.0 / inverse, area_px, 1.0, noise, **model),
         block=block[:, 1] * 4096 + block[:, 0],
     )
 

@@ -42,7 +42,7 @@ class TileErrors:
     range_m: Array  # (n,) predicted depth
     errors_m: Array  # (n,)
     sigma_m: Array  # (n,) standard deviation that makes the mean over all right; see depth_tiles
-    alone_m: Array  # (n,) what the noise model promises of a tile among those of its own face
+    alone_m: Array  # (n,) what the noise model promises of a tile by itself
 
     def __len__(self) -> int:
         """How many tiles there are."""

@@ -21,7 +21,7 @@ from aruco.depth_agreement import DepthAgreement, DepthErrors, DepthRow
 from aruco.depth_bias import DepthBias
 from aruco.depth_noise import DepthNoise
 from aruco.depth_patches import FaceDepth, typical_ratio
-from aruco.depth_tiles import face_sigma_m, face_tiles, joined, predicted_inverse
+from aruco.depth_tiles import face_sigma_m, face_tiles, predicted_inverse
 from aruco.depth_trends import TileErrors, trends
 from aruco.pose_math import Array, Pose, invert_transform
 from aruco.rig_estimate import RigEstimate
@@ -111,16 +111,14 @@ def _tile_errors(compared: Sequence[_Compared], camera: DepthCamera) -> TileErro
     """The errors of all faces, tile by tile; faces in the same part of the image share what is fixed of them."""
     poses = {c.face.frame: c.T_cam_target for c in compared}
     frames, T_cam_target = list(poses), list(poses.values())
-    known = (frames, T_cam_target, camera.K, camera.noise)
-    tiles = face_tiles([c.face for c in compared], 0, *known)
-    alone = joined([face_tiles([c.face], 0, *known) for c in compared])
+    tiles = face_tiles([c.face for c in compared], 0, frames, T_cam_target, camera.K, camera.noise)
     range_m = 1.0 / predicted_inverse(tiles, T_cam_target)
     return TileErrors(
         places=tiles.ray[:, :2],
         range_m=range_m,
         errors_m=1.0 / tiles.inverse - range_m,
         sigma_m=tiles.sigma * range_m**2,
-        alone_m=alone.sigma * range_m**2,
+        alone_m=tiles.alone * range_m**2,
     )
 
 

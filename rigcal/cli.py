@@ -76,11 +76,11 @@ def refuse_inputs(output: Path, recordings: Sequence[Path], markers: Path | None
     """
     goal = output.resolve()
     if markers is not None and goal == markers.resolve():
-        raise OutputError(f"{output}: is the marker map, an input; choose another name for the output.")
+        raise OutputError(f"{output}: is the marker map, an input; choose another name for it.")
     if kept is not None and goal == kept.resolve():
-        raise OutputError(f"{output}: is the file of the cameras to keep, an input; choose another name for the output.")
+        raise OutputError(f"{output}: is the file of the cameras to keep, an input; choose another name for it.")
     if goal.exists() and any(goal == path.resolve() for path in recordings):
-        raise OutputError(f"{output}: is a recording, an input; choose another name for the output.")
+        raise OutputError(f"{output}: is a recording, an input; choose another name for it.")
     for path in recordings:
         root = path.resolve()
         for folder in goal.parents:

@@ -22,8 +22,6 @@ from aruco.pose_math import Array
 from aruco.rig_estimate import RigEstimate
 from rigcal.evidence import Evidence
 
-# Images can be recorded more often than depth, but not many times more: then a camera has none.
-MAX_FRAMES_WITHOUT_DEPTH = 3
 # Every frame of a moved target shows it at another range and in another part of the image.
 MAX_FRAMES_MOVED = 12
 
@@ -72,8 +70,7 @@ def depth_cameras(evidence: Evidence) -> dict[str, DepthCamera]:
     told = evidence.config.depth.baseline_m
     found: dict[str, DepthCamera] = {}
     for camera in evidence.cameras:
-        K = camera.K if camera.depth_K is None else camera.depth_K
-        baseline_m = camera.baseline_m or told
+        K, baseline_m = camera.K_depth, camera.baseline_m or told
         noise = DepthNoise(focal_baseline=None if baseline_m is None else float(K[0, 0]) * baseline_m)
         found[camera.name] = DepthCamera(K=K, noise=noise)
     return found
@@ -109,7 +106,7 @@ def faces_by_frame(
         geometry: Marker id -> (k, 3) points [m], target frame.
         at_most: How many frames.
     """
-    chosen = _chosen_images(camera, rig, detections, images, at_most)
+    chosen = _chosen_images(recording, camera, rig, detections, images, at_most)
     faces: list[FaceDepth | None] = []
     for index, frame in _with_depth(recording, camera, list(chosen)):
         f, depth_m = chosen[index], np.asarray(frame.depth_m)
@@ -120,27 +117,29 @@ def faces_by_frame(
 
 
 def _chosen_images(
-    camera: Camera, rig: RigEstimate, detections: Mapping[int, Detection], images: Mapping[int, int], at_most: int
+    recording: Recording,
+    camera: Camera,
+    rig: RigEstimate,
+    detections: Mapping[int, Detection],
+    images: Mapping[int, int],
+    at_most: int,
 ) -> dict[int, int]:
     """Index into the camera's stamps -> frame, ascending: views that took part, spread over the recording."""
     used = rig.cameras[camera.name].frames
-    frames = {f: len(detections[f]) for f in used if f in detections and f in images and f in rig.T_world_target}
+    measured = set(recording.depth_indices(camera.name).tolist())
+    frames = {
+        f: len(detections[f])
+        for f in used
+        if f in detections and images.get(f) in measured and f in rig.T_world_target
+    }
     return dict(sorted((images[f], f) for f in spread_frames(frames, at_most=at_most)))
 
 
 def _with_depth(recording: Recording, camera: Camera, order: list[int]) -> Iterator[tuple[int, Frame]]:
-    """The frames at ascending indices that can be read and have depth; gives up on a camera that has none."""
-    without, found = 0, False
+    """The frames at ascending indices that can be read and have depth."""
     for index, frame in zip(order, recording.frames(camera.name, order, depth=True)):
-        if not isinstance(frame, Frame):
-            continue
-        if frame.depth_m is not None:
-            found = True
+        if isinstance(frame, Frame) and frame.depth_m is not None:
             yield index, frame
-            continue
-        without += 1
-        if without >= MAX_FRAMES_WITHOUT_DEPTH and not found:
-            return
 
 
 def _resting_faces(
@@ -170,12 +169,12 @@ def _pooled_briefly(
     evidence: Evidence, camera: Camera, rig: RigEstimate, images: Mapping[int, int]
 ) -> CameraDepth | None:
     """A few spread images of a resting scene as one; None where the camera has no depth."""
-    chosen = _chosen_images(camera, rig, evidence.detections[camera.name], images, MAX_FRAMES)
+    chosen = _chosen_images(evidence.recording, camera, rig, evidence.detections[camera.name], images, MAX_FRAMES)
     frames = [
         (frame.stamp_ns, np.asarray(frame.depth_m), frame.confidence)
         for _, frame in _with_depth(evidence.recording, camera, list(chosen))
     ]
     if not frames:
         return None
-    K = camera.K if camera.depth_K is None else camera.depth_K
+    K = camera.K_depth
     return camera_depth(pool_depth(frames, where=f"camera {camera.name}: depth"), K=K)

@@ -120,7 +120,7 @@ def _ratio(face: FaceDepth, camera: Camera, rig: RigEstimate) -> float:
 
     What the camera itself hardly trusts is left out, as in aruco.depth_verify.
     """
-    K = camera.K if camera.depth_K is None else camera.depth_K
+    K = camera.K_depth
     T_cam_target = invert_transform(rig.cameras[camera.name].T_world_cam) @ rig.T_world_target[face.frame]
     trusted = face.trusted
     return typical_ratio(face.measured_m[trusted], face.predicted_m(T_cam_target, K)[trusted])

@@ -121,8 +121,9 @@ def _all_tiles(truth: Pose, bias: Array, lean: Array, sigma: float, rng: np.rand
         n = int(seen.sum())
         measured = (exact + sigma * rng.standard_normal(n)) / (1.0 + bias[c, 0])
         target = np.where(on_floor[seen], FLOOR, 0)
-        parts.append((np.full(n, c), target, normal[seen], offset[seen], r, measured, np.full(n, sigma), blocks[seen]))
-    names = ("camera", "target", "normal", "offset_m", "ray", "inverse", "sigma", "block")
+        sigmas = (np.full(n, sigma), np.full(n, sigma))
+        parts.append((np.full(n, c), target, normal[seen], offset[seen], r, measured, *sigmas, blocks[seen]))
+    names = ("camera", "target", "normal", "offset_m", "ray", "inverse", "sigma", "alone", "block")
     return Tiles(**{name: np.concatenate(column) for name, column in zip(names, zip(*parts))})
 
 

@@ -93,7 +93,7 @@ def render_depth(scene: Scene, camera: Camera, T_world_cam: Pose) -> NDArray[np.
         (h, w) metres, NaN where nothing is.
     """
     view = _look(scene, T_world_cam)
-    K = camera.K if camera.depth_K is None else camera.depth_K
+    K = camera.K_depth
     rectified = Camera(name=camera.name, width=camera.width, height=camera.height, K=K)
     depth_m = np.empty((camera.height, camera.width), dtype=np.float32)
     for rows in _bands(camera):

@@ -198,7 +198,7 @@ class Simulation:
 
 def focal_baseline(camera: Camera) -> float:
     """Focal length times baseline of a stereo camera [px m]; 0 for a camera that is none."""
-    K = camera.K if camera.depth_K is None else camera.depth_K
+    K = camera.K_depth
     return float(K[0, 0]) * (camera.baseline_m or 0.0)
 
 
