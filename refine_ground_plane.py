@@ -35,7 +35,8 @@ PARTIAL = 3  # exit code: written, but not every camera was levelled on a floor 
 @click.option("--ransac-threshold", type=float, metavar="M",
               help="How near a plane depth must be to be part of it. Default: by the noise of depth.")  # fmt: skip
 @click.option("--height-range", type=float, nargs=2, metavar="MIN MAX",
-              help="Look for the floor only between these heights of the input's world [m].")  # fmt: skip
+              help="Look for the floor only between these heights of the input's world [m], counted along up: "
+                   "where y points down, the height of a point is -y.")  # fmt: skip
 @click.option("--stride", type=click.IntRange(min=1), default=4, show_default=True, metavar="N",
               help="Use every Nth row and column of the depth.")  # fmt: skip
 @click.option("--target-floor-y", type=float, default=0.0, show_default=True, metavar="M",
@@ -50,7 +51,7 @@ def main(**given: Any) -> None:
     height are corrected as far as the floor knows them better than its pose. Yaw, x and z stay.
 
     Exit codes: 0 all cameras levelled, 1 an error, 2 wrong usage, 3 written, but some camera sees no floor, or one that
-    contradicts the others'.
+    contradicts the others' or its own pose: see its warnings.
     """
     if given["plot"] is False and given["plot_output"]:
         raise click.UsageError("--plot-output names a page that --no-plot forbids: give one of them")

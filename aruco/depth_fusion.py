@@ -32,6 +32,8 @@ from aruco.pose_math import Array, Pose, exp_se3
 
 # 95 % efficient for clean Gaussian tiles (Holland and Welsch 1977), deaf to things that lie on the floor.
 KAPPA = 2.385
+# Of clean tiles, what the estimate knows over its sum of squared weights: E[psi']^2 / E[psi^2] / E[w^2] for psi = w x.
+CURVATURE = 1.206
 MAX_STEPS = 25
 CONVERGED = 1e-3  # of what is known of an unknown
 _MAD_TO_SIGMA = 1.4826
@@ -57,8 +59,8 @@ class MarkerEquations:
         if self.doubt is None:
             return self
         free = np.repeat(self.free, 6)
-        P = _inverse(self.H, free)
-        H = _inverse(P + self.doubt @ self.doubt.T, free)
+        P = inverse_over(self.H, free)
+        H = inverse_over(P + self.doubt @ self.doubt.T, free)
         return replace(self, H=H, g=H @ P @ self.g, doubt=None)
 
 
@@ -88,22 +90,26 @@ class Estimate:
     known: Array | None = None  # (c, 2) what the data know of each camera's bias, in its prior's information; ascending
 
 
-def start_estimate(markers: MarkerEquations, floor: tuple[Array, float] | None) -> Estimate:
-    """Where the markers' optimum is, with true depth."""
+def given_estimate(markers: MarkerEquations, floor: tuple[Array, float] | None) -> Estimate:
+    """The poses given, with true depth."""
     n = len(markers.cameras)
-    free = np.repeat(markers.free, 6)
-    x = np.zeros(len(free))
-    if free.any():
-        x[free] = -np.linalg.solve(markers.H[np.ix_(free, free)], markers.g[free])
-    at = Estimate(
+    return Estimate(
         T_world_cam=markers.T_world_cam,
         T_world_target=markers.T_world_target,
-        twist=np.zeros(len(free)),
+        twist=np.zeros(6 * len(markers.free)),
         bias=np.zeros((n, 2)),
         lean=np.zeros((n, 2)),
         floor=floor,
     )
-    return _moved(at, np.concatenate([x, np.zeros(4 * n + 3)]))
+
+
+def start_estimate(markers: MarkerEquations, floor: tuple[Array, float] | None) -> Estimate:
+    """Where the markers' optimum is, with true depth."""
+    free = np.repeat(markers.free, 6)
+    x = np.zeros(len(free))
+    if free.any():
+        x[free] = -np.linalg.solve(markers.H[np.ix_(free, free)], markers.g[free])
+    return _moved(given_estimate(markers, floor), np.concatenate([x, np.zeros(4 * len(markers.cameras) + 3)]))
 
 
 def fuse(
@@ -126,7 +132,7 @@ def fuse(
         start: Near the result; a floor there is estimated too, without one tiles on it are not used.
         lean_px: Standard deviation of the leans: disparity a unit of the ray; 0: there are none.
         fixed_bias: (c, 2) parameters that stay zero; what is not known of them is part of the covariance.
-        fixed_poses: Estimate floor and biases alone.
+        fixed_poses: Estimate floor and biases alone; what is not known of the poses is part of the covariance.
         scale: Of the residuals; None: from themselves.
     """
     if start.floor is None:
@@ -150,6 +156,17 @@ def fuse(
         if (step[free] ** 2 * np.diag(A)[free]).max(initial=0.0) < CONVERGED**2:
             break
     return problem.known(replace(at, scale=said), free)
+
+
+def without_lean(
+    markers: MarkerEquations, tiles: Tiles, sensors: Mapping[str, DepthSensor], at: Estimate, held: NDArray[np.bool_]
+) -> Estimate:
+    """The biases that are best where nothing else is taken out of the depth: poses stay, and there are no leans.
+
+    Whoever corrects depth later has these two numbers a camera alone.
+    """
+    start = replace(at, bias=np.where(held, 0.0, at.bias), lean=np.zeros_like(at.lean))
+    return fuse(markers, tiles, sensors, start, lean_px=0.0, fixed_bias=held, fixed_poses=True, scale=at.scale)
 
 
 def residuals(tiles: Tiles, at: Estimate, sensors: Mapping[str, DepthSensor], markers: MarkerEquations) -> Array:
@@ -299,13 +316,10 @@ class _Problem:
         """The estimate with its covariance, and with what data say about the biases."""
         e, J = self.rows(at)
         sigma = self.tiles.sigma * at.scale
-        # The mean second derivative of the loss goes with the squared weights (see rigcal.solve.adjust).
-        A, _ = self.normal(at, e, J, _weights(e, sigma) ** 2 * sigma**2)
+        # Squared weights as in rigcal.solve.adjust; tiles have one coordinate, corners two.
+        A, _ = self.normal(at, e, J, CURVATURE * _weights(e, sigma) ** 2 * sigma**2)
         n_pose, n_cam = len(at.twist), len(at.bias)
-        P = _inverse(A, free)
-        held = ~free[n_pose : n_pose + 2 * n_cam]
-        if held.any():
-            P = P + self._of_held(A, P, n_pose + np.flatnonzero(held))
+        P = self._with_held(A, inverse_over(A, free), free)
         if self.markers.doubt is not None:
             follows = P[:, :n_pose] @ self.markers.H @ self.markers.doubt
             P = P + follows @ follows.T
@@ -322,13 +336,18 @@ class _Problem:
             total += 0.0 if self.lean_px <= 0 else float(((lean / (self.lean_px * sensor.lean_unit)) ** 2).sum())
         return float(total)
 
-    def _of_held(self, A: Array, P: Array, held: NDArray[np.int64]) -> Array:
-        """What biases that were held at zero, but are no better known than their prior, add to a covariance P."""
-        n_pose = len(A) - 4 * len(self.sensors) - 3
-        prior = np.array([np.diag(sensor.prior) for sensor in self.sensors]).ravel()[held - n_pose]
+    def _with_held(self, A: Array, P: Array, free: NDArray[np.bool_]) -> Array:
+        """A covariance P, with what poses and biases add that were held, but are no better known than beforehand."""
+        n_pose, n_bias = len(self.markers.H), 2 * len(self.sensors)
+        movable = np.repeat(self.markers.free, 6)
+        held = np.flatnonzero(~free[: n_pose + n_bias] & np.append(movable, np.ones(n_bias, dtype=bool)))
+        if not len(held):
+            return P
+        before = np.diag(np.append(np.zeros(n_pose), [np.diag(sensor.prior) for sensor in self.sensors]))
+        before[:n_pose, :n_pose] = inverse_over(self.markers.H, movable)
         response = -P @ A[:, held]
         response[held] = np.eye(len(held))
-        return (response * prior) @ response.T
+        return P + response @ before[np.ix_(held, held)] @ response.T
 
     def _information(self, A: Array, free: NDArray[np.bool_], first: int, sensor: DepthSensor) -> Array:
         """Eigenvalues (2,), ascending, of what everything but its prior knows of one camera's bias, in the prior's."""
@@ -337,15 +356,15 @@ class _Problem:
         others[mine] = False
         C = A[np.ix_(mine, others)]
         root = np.linalg.cholesky(sensor.prior)
-        data = A[np.ix_(mine, mine)] - C @ _inverse(A, others)[np.ix_(others, others)] @ C.T
+        data = A[np.ix_(mine, mine)] - C @ inverse_over(A, others)[np.ix_(others, others)] @ C.T
         return np.linalg.eigvalsh(root.T @ data @ root) - 1.0
 
 
-def _inverse(A: Array, free: NDArray[np.bool_]) -> Array:
-    """The inverse over the free unknowns, zero elsewhere."""
+def inverse_over(A: Array, free: NDArray[np.bool_]) -> Array:
+    """The inverse over the free unknowns, zero elsewhere: covariance from information, and back."""
     P = np.zeros_like(A)
     M = A[np.ix_(free, free)]
-    d = 1.0 / np.sqrt(np.maximum(np.diag(M), 1e-12))
+    d = 1.0 / np.sqrt(np.maximum(np.diag(M), 1e-24))
     inverse = np.linalg.pinv(M * np.outer(d, d), rcond=1e-13, hermitian=True) * np.outer(d, d)
     P[np.ix_(free, free)] = (inverse + inverse.T) / 2
     return P

@@ -1,8 +1,8 @@
 """Letting depth correct what markers have found, as far as it proves right on what was not used.
 
 Owns      which biases can be told apart, how large leans are, when markers are doubted, the bounds, the words.
-Leaves    the estimate itself to depth_fusion, the test on held-out markers and depth to depth_trial, tiles to
-          depth_tiles, the markers' equations to their maker.
+Leaves    the estimate itself to depth_fusion, the test on held-out markers and depth to depth_trial, depth that cannot
+          be true to depth_faults, tiles to depth_tiles, the markers' equations to their maker.
 """
 
 from __future__ import annotations
@@ -17,16 +17,19 @@ from loguru import logger
 from numpy.typing import NDArray
 
 from aruco.depth_bias import DepthBias
+from aruco.depth_faults import worst_fault
 from aruco.depth_fusion import (
     DepthSensor,
     Estimate,
     MarkerEquations,
     bias_of,
     fuse,
+    given_estimate,
     start_estimate,
+    without_lean,
 )
 from aruco.depth_tiles import FLOOR, Tiles
-from aruco.depth_trial import HeldOut, MarkerHalf, on_held_out
+from aruco.depth_trial import HeldOut, MarkerHalf, Trial, on_held_out
 from aruco.pose_math import Array, Pose, pose_distance
 
 # Data must know the worse known mixture of a bias's two parameters at least as well as the prior does. Else they cannot
@@ -42,25 +45,33 @@ LEANS_PX = np.geomspace(0.01, 0.3, 12)
 class DepthRefinement:
     """What depth has corrected, or why nothing was."""
 
-    accepted: bool
+    poses_accepted: bool  # depth has moved the poses
+    bias_accepted: bool  # its biases are taken out of depth; poses may have stayed
     reason: str  # in words, either way
-    T_world_cam: Mapping[str, Pose]  # the poses given, unless accepted
+    T_world_cam: Mapping[str, Pose]  # the poses given, unless these are moved
     T_world_target: Mapping[int, Pose]
-    covariance: Mapping[str, Array] = field(default_factory=dict)  # camera -> (6, 6); empty unless accepted
-    common: Mapping[tuple[str, str], Array] = field(default_factory=dict)  # of two cameras; likewise
-    biases: Mapping[str, DepthBias] = field(default_factory=dict)  # likewise, of cameras that tell
+    covariance: Mapping[str, Array] = field(default_factory=dict)  # camera -> (6, 6); empty unless poses are moved
+    biases: Mapping[str, DepthBias] = field(default_factory=dict)  # of cameras that tell; empty unless accepted
     findings: Mapping[str, str] = field(default_factory=dict)  # camera -> what its depth tells, in words
+    left_out: Mapping[str, str] = field(default_factory=dict)  # camera whose depth cannot be true -> why, in words
     moved: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # camera -> turn [rad], shift [m]
     patches: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # camera -> number on the target, on the floor
     scale: float = 1.0  # how many times larger residuals of depth are than its noise model promises
     lean_px: float = 0.0  # how much disparity errs across the images, typically, a unit of the ray
     held_out: HeldOut | None = None
 
+    @property
+    def accepted(self) -> bool:
+        """Whether depth has corrected anything."""
+        return self.poses_accepted or self.bias_accepted
+
     def as_dict(self) -> dict[str, Any]:
         """The layout of ``_meta.depth_refined``."""
         held = self.held_out
         return {
             "accepted": self.accepted,
+            "poses_accepted": self.poses_accepted,
+            "bias_accepted": self.bias_accepted,
             "reason": self.reason,
             "residual_scale": self.scale,
             "lean_px": self.lean_px,
@@ -71,31 +82,48 @@ class DepthRefinement:
                 "markers": held.n_markers,
                 "marker_rms_px": {"before": held.marker_px[0], "after": held.marker_px[1]},
                 "depth_patches": held.n_patches,
-                "depth_median_mm": {"before": held.depth_mm[0], "after": held.depth_mm[1]},
+                "depth_median_mm": dict(zip(("before", "biases_alone", "after"), held.depth_mm)),
             },
         }
 
     def _of_camera(self, name: str) -> dict[str, Any]:
         turn, shift = self.moved.get(name, (0.0, 0.0))
         on_target, on_floor = self.patches.get(name, (0, 0))
+        growth = None if self.held_out is None else self.held_out.growth.get(name)
         return {
             "finding": self.findings[name],
+            "left_out": name in self.left_out,
             "turn_deg": math.degrees(turn),
             "shift_mm": 1e3 * shift,
             "patches_on_target": on_target,
             "patches_on_floor": on_floor,
+            "held_out_markers": None
+            if growth is None
+            else {"n": growth.n_markers, "squares_grow": growth.squares, "by_chance": growth.chance},
         }
 
 
 def kept_as_it_was(markers: MarkerEquations, reason: str, **told: Any) -> DepthRefinement:
     """The poses given, and why depth does not correct them."""
     return DepthRefinement(
-        accepted=False,
+        poses_accepted=False,
+        bias_accepted=False,
         reason=reason,
         T_world_cam=dict(zip(markers.cameras, markers.T_world_cam)),
         T_world_target=dict(zip(markers.targets, markers.T_world_target)),
         **told,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Fit:
+    """Everything in one estimate, before anybody believes it."""
+
+    markers: MarkerEquations  # less sure of, where depth shows what they doubt
+    tiles: Tiles  # of cameras that take part
+    found: Estimate
+    lean_px: float
+    left_out: Mapping[str, str]
 
 
 def refine(
@@ -108,7 +136,7 @@ def refine(
     max_rotation_deg: float = 5.0,
     max_translation_m: float = 0.1,
 ) -> DepthRefinement:
-    """Correct poses with depth and estimate its biases, if that predicts what took no part at least as well.
+    """Correct poses with depth and estimate its biases, each if that predicts what took no part at least as well.
 
     Args:
         markers: What all markers know.
@@ -116,8 +144,8 @@ def refine(
         tiles: What depth says.
         sensors: Camera -> its depth.
         floor: Roughly, normal and normal . X in the world; None: nobody knows.
-        max_rotation_deg: No camera is turned farther.
-        max_translation_m: Nor moved.
+        max_rotation_deg: If any camera were turned farther, no pose is moved.
+        max_translation_m: Likewise.
 
     Returns:
         The correction, or the poses given and the reason.
@@ -126,32 +154,48 @@ def refine(
         tiles = tiles.only(tiles.target != FLOOR)
     if not len(tiles):
         return kept_as_it_was(markers, "no camera has depth on the target or the floor")
-    start = start_estimate(markers, floor)
-    lean_px = lean_size(markers, tiles, sensors, start)
-    found = fuse(markers, tiles, sensors, start, lean_px=lean_px)
-    if markers.doubt is not None:
-        doubting = fuse(markers.doubting(), tiles, sensors, start, lean_px=lean_px, scale=found.scale)
-        if found.cost - doubting.cost > _more_than_chance(len(markers.cameras)):
-            logger.debug("depth shows what markers doubt: their poses are trusted less")
-            markers, found = markers.doubting(), doubting
-            halves = [replace(half, train=half.train.doubting()) for half in halves]
-    held = inseparable(found)
-    if held.any():
-        found = fuse(markers, tiles, sensors, start, lean_px=lean_px, fixed_bias=held)
+    fit = _fitted(markers, tiles, sensors, floor)
     told: dict[str, Any] = {
-        "findings": {n: _finding(n, c, found, held, tiles, sensors[n]) for c, n in enumerate(markers.cameras)},
-        "patches": {n: _count(tiles, c) for c, n in enumerate(markers.cameras)},
-        "scale": found.scale,
-        "lean_px": lean_px,
+        "left_out": fit.left_out,
+        "patches": {name: _count(tiles, c) for c, name in enumerate(markers.cameras)},
+        "scale": fit.found.scale,
+        "lean_px": fit.lean_px,
     }
-    too_far = _beyond_bounds(markers, found, max_rotation_deg, max_translation_m)
+    if not len(fit.tiles):
+        return kept_as_it_was(markers, "no camera's depth can be true", findings=fit.left_out, **told)
+    held = inseparable(fit.found)
+    if held.any():
+        again = fuse(fit.markers, fit.tiles, sensors, fit.found, lean_px=fit.lean_px, fixed_bias=held)
+        fit = replace(fit, found=again)
+    if fit.markers is not markers:
+        halves = [replace(half, train=half.train.doubting()) for half in halves]
+    trial = on_held_out(halves, fit.tiles, sensors, floor, held, (fit.found.scale, fit.lean_px))
+    told |= {"held_out": trial.figures, "scale": fit.found.scale}
+    too_far = _beyond_bounds(markers, fit.found, max_rotation_deg, max_translation_m)
     if too_far:
-        return kept_as_it_was(markers, too_far, **told)
-    figures, worse = on_held_out(halves, tiles, sensors, floor, held, (found.scale, lean_px))
-    told["held_out"] = figures
-    if worse:
-        return kept_as_it_was(markers, worse, **told)
-    return replace(_result(markers, found, held, sensors), reason=_why(figures), **told)
+        trial = replace(trial, against_move=too_far)
+    return replace(_judged(fit, trial, held, sensors, floor), **told)
+
+
+def _fitted(
+    markers: MarkerEquations, tiles: Tiles, sensors: Mapping[str, DepthSensor], floor: tuple[Array, float] | None
+) -> _Fit:
+    """Everything in one estimate, without cameras whose depth cannot be true: the worst goes first."""
+    start, left_out = start_estimate(markers, floor), dict[str, str]()
+    while True:
+        lean_px = lean_size(markers, tiles, sensors, start)
+        found, trusted = fuse(markers, tiles, sensors, start, lean_px=lean_px), markers
+        if markers.doubt is not None:
+            doubting = fuse(markers.doubting(), tiles, sensors, start, lean_px=lean_px, scale=found.scale)
+            if found.cost - doubting.cost > _more_than_chance(len(markers.cameras)):
+                logger.debug("depth shows what markers doubt: their poses are trusted less")
+                trusted, found = markers.doubting(), doubting
+        fault = worst_fault(found, trusted, tiles, sensors)
+        if fault is not None:
+            left_out[markers.cameras[fault.camera]] = fault.said
+            tiles = tiles.only(tiles.camera != fault.camera)
+        if fault is None or not len(tiles):
+            return _Fit(markers=trusted, tiles=tiles, found=found, lean_px=lean_px, left_out=left_out)
 
 
 def lean_size(markers: MarkerEquations, tiles: Tiles, sensors: Mapping[str, DepthSensor], start: Estimate) -> float:
@@ -181,33 +225,80 @@ def inseparable(found: Estimate) -> NDArray[np.bool_]:
     return np.stack([worse < SEPARABLE, better < SEPARABLE], axis=1)
 
 
-def _result(
-    markers: MarkerEquations, found: Estimate, held: NDArray[np.bool_], sensors: Mapping[str, DepthSensor]
+def _judged(
+    fit: _Fit,
+    trial: Trial,
+    held: NDArray[np.bool_],
+    sensors: Mapping[str, DepthSensor],
+    floor: tuple[Array, float] | None,
 ) -> DepthRefinement:
-    assert found.covariance is not None, "fuse has told"
-    names, n_pose = markers.cameras, len(found.twist)
-    P = found.covariance
-    blocks = P[: 6 * len(names), : 6 * len(names)].reshape(len(names), 6, len(names), 6)
-    of_bias = [P[n_pose + 2 * c : n_pose + 2 * c + 2, n_pose + 2 * c : n_pose + 2 * c + 2] for c in range(len(names))]
-    return DepthRefinement(
-        accepted=True,
-        reason="",
-        T_world_cam=dict(zip(names, found.T_world_cam)),
-        T_world_target=dict(zip(markers.targets, found.T_world_target)),
+    """What is used of a fit after its trial: all of it, biases beside the poses given, or nothing."""
+    markers, names, moves = fit.markers, fit.markers.cameras, not trial.against_move
+    at = fit.found if moves else replace(given_estimate(markers, floor), scale=fit.found.scale)
+    alone = without_lean(markers, fit.tiles, sensors, at, held)
+    biases = _biases(fit.found if moves else alone, alone, held, sensors, names)
+    findings = {n: _finding(biases.get(n), held[c], fit.tiles.only(fit.tiles.camera == c)) for c, n in enumerate(names)}
+    told: dict[str, Any] = {"findings": findings | dict(fit.left_out)}
+    if not moves and (trial.against_bias or not biases):
+        why = trial.against_bias or "there is too little depth to tell any bias"
+        return kept_as_it_was(markers, f"{trial.against_move}; {why}", **told)
+    kept = kept_as_it_was(markers, _why(trial, moves=moves), biases=biases, **told)
+    kept = replace(kept, bias_accepted=bool(biases))
+    if not moves:
+        return kept
+    assert fit.found.covariance is not None, "fuse has told"
+    blocks = fit.found.covariance[: 6 * len(names), : 6 * len(names)].reshape(len(names), 6, len(names), 6)
+    return replace(
+        kept,
+        poses_accepted=True,
+        T_world_cam=dict(zip(names, fit.found.T_world_cam)),
+        T_world_target=dict(zip(markers.targets, fit.found.T_world_target)),
         covariance={name: blocks[c, :, c] for c, name in enumerate(names) if markers.free[c]},
-        common={(a, b): blocks[i, :, j] for i, a in enumerate(names) for j, b in enumerate(names) if i != j},
-        biases={n: bias_of(sensors[n], found.bias[c], of_bias[c]) for c, n in enumerate(names) if not held[c].all()},
-        moved={n: pose_distance(a, b) for n, a, b in zip(names, markers.T_world_cam, found.T_world_cam)},
+        moved={n: pose_distance(a, b) for n, a, b in zip(names, markers.T_world_cam, fit.found.T_world_cam)},
     )
 
 
-def _why(figures: HeldOut) -> str:
-    """Why the result is believed."""
+def _biases(
+    known: Estimate,
+    written: Estimate,
+    held: NDArray[np.bool_],
+    sensors: Mapping[str, DepthSensor],
+    names: Sequence[str],
+) -> dict[str, DepthBias]:
+    """What is written of every camera that tells.
+
+    The truth is known by an estimate that has leans; the numbers written are best without them. Their mean square
+    error is that estimate's covariance and the square of the difference.
+    """
+    assert known.covariance is not None, "fuse has told"
+    biases: dict[str, DepthBias] = {}
+    for c, name in enumerate(names):
+        if not held[c].all():
+            mine = slice(len(known.twist) + 2 * c, len(known.twist) + 2 * c + 2)
+            apart = written.bias[c] - known.bias[c]
+            biases[name] = bias_of(
+                sensors[name], written.bias[c], known.covariance[mine, mine] + np.outer(apart, apart)
+            )
+    return biases
+
+
+def _why(trial: Trial, *, moves: bool) -> str:
+    """Why the result is believed, and what could not be asked."""
+    figures = trial.figures
+    if not moves:
+        mm = figures.depth_mm
+        tested = f"{mm[0]:.3g} mm before, {mm[1]:.3g} mm after" if figures.n_patches else "there was none to hold out"
+        return f"{trial.against_move}; poses stay, biases are taken out of depth (held-out depth: {tested})"
     tested = [what for what, n in (("markers", figures.n_markers), ("depth", figures.n_patches)) if n]
-    untested = "" if len(tested) == 2 else "; there was too little to hold out " + ("markers" if tested else "anything")
-    return (
-        f"{' and '.join(tested)} that took no part are predicted at least as well{untested}" if tested else untested[2:]
-    )
+    untested = [name for name, growth in figures.growth.items() if not growth.n_markers]
+    if not tested:
+        return "there was nothing to hold out, so nothing was tested"
+    said = f"{' and '.join(tested)} that took no part are predicted at least as well"
+    if not figures.n_markers:
+        return f"{said}; no markers could be held out"
+    if untested:
+        said += f"; no markers of camera {', camera '.join(untested)} could be held out"
+    return said if figures.n_patches else f"{said}; no depth could be held out"
 
 
 def _more_than_chance(n: int) -> float:
@@ -238,31 +329,27 @@ def _beyond_bounds(markers: MarkerEquations, found: Estimate, max_rotation_deg: 
 # --- words ----------------------------------------------------------------------------------------------------------
 
 
-def _finding(
-    name: str, camera: int, found: Estimate, held: NDArray[np.bool_], tiles: Tiles, sensor: DepthSensor
-) -> str:
-    """What a camera's depth tells, in words."""
-    mine = tiles.camera == camera
-    if held[camera].all():
+def _finding(bias: DepthBias | None, held: NDArray[np.bool_], tiles: Tiles) -> str:
+    """What a camera's depth tells on its tiles, in words."""
+    if bias is None or not len(tiles):
         return "too little depth on target and floor to tell its bias"
-    near, far = (1.0 / tiles.inverse[mine].max(), 1.0 / tiles.inverse[mine].min())
-    assert found.covariance is not None, "fuse has told"
-    first = len(found.twist) + 2 * camera
-    sigma = np.sqrt(np.diag(found.covariance)[first : first + 2])
-    where = f"on {int(mine.sum())} patches from {near:.1f} to {far:.1f} m"
-    second = _second(sensor, float(found.bias[camera, 1]), float(sigma[1]))
-    middle = np.array([float(np.median(1.0 / tiles.inverse[mine]))])
-    off_mm = 1e3 * float(middle[0] - bias_of(sensor, found.bias[camera]).corrected(middle)[0])
+    assert bias.covariance is not None, "it was estimated"
+    sigma = np.sqrt(np.diag(bias.covariance))
+    near, far = (1.0 / tiles.inverse.max(), 1.0 / tiles.inverse.min())
+    where = f"on {len(tiles)} patches from {near:.1f} to {far:.1f} m"
+    second = _second(bias, float(sigma[1]))
+    middle = np.array([float(np.median(1.0 / tiles.inverse))])
+    off_mm = 1e3 * float(middle[0] - bias.corrected(middle)[0])
     side = f"{abs(off_mm):.0f} mm too {'far' if off_mm > 0 else 'near'} at {middle[0]:.1f} m"
-    if held[camera, 0]:
-        what = "offset" if sensor.model == "offset" else "disparity"
+    if held[0]:
+        what = "offset" if bias.model == "offset" else "disparity"
         return f"ranges {where} do not tell scale from {what}: scale is left at 0, {second}; {side}"
-    return f"scale {100 * found.bias[camera, 0]:+.2f} +- {100 * sigma[0]:.2f} %, {second}, {where}; {side}"
+    return f"scale {100 * bias.scale:+.2f} +- {100 * sigma[0]:.2f} %, {second}, {where}; {side}"
 
 
-def _second(sensor: DepthSensor, value: float, sigma: float) -> str:
-    if sensor.model == "offset":
-        return f"offset {1e3 * value:+.1f} +- {1e3 * sigma:.1f} mm"
-    if sensor.focal_baseline is None:
-        return f"inverse depth {value:+.5f} +- {sigma:.5f} 1/m"
-    return f"disparity {value * sensor.focal_baseline:+.3f} +- {sigma * sensor.focal_baseline:.3f} px"
+def _second(bias: DepthBias, sigma: float) -> str:
+    if bias.model == "offset":
+        return f"offset {1e3 * bias.offset_m:+.1f} +- {1e3 * sigma:.1f} mm"
+    if bias.focal_baseline is None:
+        return f"inverse depth {bias.inverse_depth:+.5f} +- {sigma:.5f} 1/m"
+    return f"disparity {bias.disparity_px:+.3f} +- {sigma * bias.focal_baseline:.3f} px"

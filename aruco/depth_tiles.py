@@ -109,6 +109,7 @@ class _Surface:
     offset_m: float = 0.0
     n_averaged: float = 1.0
     uneven_m: float = 0.0
+    nearness: float = 0.0  # one over the camera's distance from its plane [1/m]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -154,6 +155,7 @@ def face_tiles(
             offset_m=face.offset_m,
             n_averaged=face.n_averaged,
             uneven_m=FACE_UNEVEN_M,
+            nearness=float(np.linalg.norm(q)),
         )
         found.append((surface, _squares(face.pixels[trusted], face.measured_m[trusted], q, K, noise)))
     return _as_tiles(found, noise)
@@ -185,7 +187,8 @@ def floor_tiles(
         stride: See pixels.
     """
     q = plane_in_camera(*floor, invert_transform(T_world_cam))
-    surface = _Surface(camera=camera, n_averaged=n_averaged, uneven_m=FLOOR_UNEVEN_M)
+    nearness = float(np.linalg.norm(q))
+    surface = _Surface(camera=camera, n_averaged=n_averaged, uneven_m=FLOOR_UNEVEN_M, nearness=nearness)
     return _as_tiles([(surface, _squares(pixels, measured_m, q, K, noise, stride=stride))], noise)
 
 
@@ -203,7 +206,7 @@ def surface_tiles(
         n_averaged: Depth images that were pooled.
         uneven_m: How flat the surface is [m].
     """
-    surface = _Surface(n_averaged=n_averaged, uneven_m=uneven_m)
+    surface = _Surface(n_averaged=n_averaged, uneven_m=uneven_m, nearness=float(np.linalg.norm(q)))
     return _as_tiles([(surface, _squares(pixels, measured_m, q, K, noise))], noise)
 
 
@@ -238,12 +241,12 @@ def _as_tiles(found: Sequence[tuple[_Surface, _Squares]], noise: DepthNoise) -> 
         np.concatenate([getattr(squares, name) for _, squares in found])
         for name in ("cell", "area_px", "ray", "inverse")
     )
-    camera, target, normal, offset_m, n_averaged, uneven_m = (
+    camera, target, normal, offset_m, n_averaged, uneven_m, nearness = (
         np.repeat(np.array([getattr(surface, f.name) for surface, _ in found]), sizes, axis=0) for f in fields(_Surface)
     )
     sharing = _sharing(cell, target, area_px)
     block = cell // (BLOCK_PX // TILE_PX)
-    model = {"n_averaged": n_averaged, "uneven_m": uneven_m}
+    model = {"n_averaged": n_averaged, "uneven_m": uneven_m, "nearness": nearness}
     return Tiles(
         camera=camera,
         target=target,
@@ -288,8 +291,12 @@ def tile_sigma(
     *,
     n_averaged: ArrayLike,
     uneven_m: ArrayLike,
+    nearness: ArrayLike | None = None,
 ) -> Array:
     """Standard deviation (n,) of a tile's mean inverse depth [1/m].
+
+    A bump u of a plane at the distance o from the camera changes ``1 / z`` by ``u / (z o)``: under a grazing look
+    by more than by u along the optical axis.
 
     Args:
         depth_m: (n,) of the tiles.
@@ -297,12 +304,14 @@ def tile_sigma(
         sharing: (n,) tiles that have the same fixed error; below one, parts of a tile with errors of their own.
         noise: Of one pixel.
         n_averaged: Depth images that were pooled.
-        uneven_m: How flat the surface is [m].
+        uneven_m: How flat the surface is, across itself [m].
+        nearness: One over the distance of the camera from its plane [1/m]; None: it is looked at face on.
     """
     z, area, shared, uneven = (np.asarray(x, dtype=np.float64) for x in (depth_m, area_px, sharing, uneven_m))
+    bump_m = uneven * (1.0 if nearness is None else z * np.asarray(nearness, dtype=np.float64))
     fixed2 = noise.fixed_sigma_m(z) ** 2
     changing2 = np.maximum(noise.averaged_sigma_m(z, n_averaged) ** 2 - fixed2, 0.0)
-    variance = (fixed2 + uneven**2) * shared + changing2 * np.minimum(TEMPORAL_CORRELATION_PX**2 / area, 1.0)
+    variance = (fixed2 + bump_m**2) * shared + changing2 * np.minimum(TEMPORAL_CORRELATION_PX**2 / area, 1.0)
     return np.sqrt(variance) / z**2
 
 

@@ -4,35 +4,50 @@ Owns      the halves, the comparison, what counts as worse.
 Leaves    the estimates to depth_fusion.
 
 Half of the markers and every second square of the depth images are used; the others are predicted. Then the same the
-other way round.
+other way round. Depth corrects two things, and each is asked for by itself: biases alone against depth as it was
+recorded, and poses that move against biases alone, or the biases' gain would hide a wrong move.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aruco.depth_fusion import KAPPA, DepthSensor, MarkerEquations, fuse, residuals, start_estimate
+from aruco.depth_fusion import (
+    KAPPA,
+    DepthSensor,
+    MarkerEquations,
+    fuse,
+    residuals,
+    start_estimate,
+    without_lean,
+)
 from aruco.depth_tiles import FLOOR, Tiles
 from aruco.pose_math import Array, Pose
 
-# Worse is what is worse by two standard errors of paired differences, and by a share that matters.
+# Depth is worse where it is worse by two standard errors of paired differences, and by a share that matters.
 SIGNIFICANT = 2.0
 NOTICEABLE = 0.01
 # Fewer pairs have no standard error worth the name.
 MIN_PAIRS = 4
+# Markers are worse where their squares grow by three times what chance makes of such a move, and by this many squared
+# sigmas: what one more wrong corner adds, which is no harm to speak of.
+CHANCES = 3.0
+MIN_GROWTH = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HeldOutMarkers:
-    """How far off markers are that took no part."""
+    """How far off n corners are that took no part."""
 
-    cost: Array  # (g,) robust loss of each marker in a view
-    squares_px2: Array  # (g,) mean squared distance of its corners
+    camera: NDArray[np.int64]  # (n,) index
+    marker: NDArray[np.int64]  # (n,) number of its marker in its view
+    off: Array  # (n, 2) in standard deviations
+    off_px: Array  # (n, 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,13 +60,51 @@ class MarkerHalf:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Growth:
+    """What a move of the poses does to the squares of held-out corners.
+
+    Corners whose prediction moves by m, in their own sigmas, change the sum of their squares by ``2 r . m + |m|^2``,
+    whose first part has the standard deviation ``2 |m|`` by chance.
+    """
+
+    n_markers: int
+    squares: float  # by how much their sum grows
+    chance: float  # standard deviation
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the move does harm."""
+        return self.squares > max(CHANCES * self.chance, MIN_GROWTH)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOut:
     """Residuals of what took no part: without depth, and with it."""
 
     n_markers: int
-    marker_px: tuple[float, float]  # root mean square
+    marker_px: tuple[float, float]  # root mean square: markers alone, poses moved by depth
     n_patches: int
-    depth_mm: tuple[float, float]  # median distance
+    depth_mm: tuple[float, float, float]  # median distance: as recorded, biases alone, poses moved too
+    growth: Mapping[str, Growth] = field(default_factory=dict)  # camera -> of its markers when poses move
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """The figures, and what became worse, in words; empty: nothing."""
+
+    figures: HeldOut
+    against_bias: str  # biases alone
+    against_move: str  # poses that move, with biases
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Compared:
+    """Held-out corners and tiles of one half."""
+
+    markers: tuple[HeldOutMarkers, HeldOutMarkers]  # markers alone, poses moved
+    loss: Array  # (n, 3) of tiles: as recorded, biases alone, poses moved too
+    distance_m: Array  # (n, 3)
+    block: Array  # (n,)
 
 
 def on_held_out(
@@ -61,27 +114,44 @@ def on_held_out(
     floor: tuple[Array, float] | None,
     held: NDArray[np.bool_],
     sizes: tuple[float, float],
-) -> tuple[HeldOut, str]:
-    """Figures on what each half has not used, and what became worse, in words."""
+) -> Trial:
+    """Figures on what each half has not used, and what became worse.
+
+    Args:
+        halves: Two halves of the markers; none: nothing is held out.
+        tiles: What depth says.
+        sensors: Camera -> its depth.
+        floor: Roughly.
+        held: (c, 2) parameters of biases that stay zero.
+        sizes: Scale of the residuals, size of the leans.
+    """
     odd = _is_odd(tiles)
     compared = [
         _compared(half, tiles, odd if k % 2 else ~odd, sensors, floor, held, sizes) for k, half in enumerate(halves)
     ]
-    markers = [np.concatenate([np.empty((0, 2)), *(pair[0][k] for pair in compared)]) for k in (0, 1)]
-    depth = [np.concatenate([np.empty((0, 3)), *(pair[1][k] for pair in compared)]) for k in (0, 1)]
-    figures = HeldOut(
-        n_markers=len(markers[0]),
-        marker_px=(_rms(markers[0][:, 1]), _rms(markers[1][:, 1])),
-        n_patches=len(depth[0]),
-        depth_mm=(_median(1e3 * depth[0][:, 1]), _median(1e3 * depth[1][:, 1])),
+    names = halves[0].train.cameras if halves else ()
+    growth = {name: _growth(compared, c) for c, name in enumerate(names)}
+    loss, distance_m = (
+        np.concatenate([np.empty((0, 3)), *(getattr(k, name) for k in compared)]) for name in ("loss", "distance_m")
     )
-    if _is_worse(markers[0][:, 0], markers[1][:, 0], np.arange(float(len(markers[0])))):
-        px = figures.marker_px
-        return figures, f"held-out markers are predicted worse with depth: {px[0]:.3g} px before, {px[1]:.3g} px after"
-    if _is_worse(depth[0][:, 0], depth[1][:, 0], depth[0][:, 2]):
-        mm = figures.depth_mm
-        return figures, f"held-out depth agrees no better with it: {mm[0]:.3g} mm before, {mm[1]:.3g} mm after"
-    return figures, ""
+    block = np.concatenate([np.empty(0), *(k.block for k in compared)])
+    recorded, alone, moved = loss.T
+    mm = tuple(1e3 * _median(column) for column in distance_m.T)
+    figures = HeldOut(
+        n_markers=sum(g.n_markers for g in growth.values()),
+        marker_px=(_rms([k.markers[0] for k in compared]), _rms([k.markers[1] for k in compared])),
+        n_patches=len(block),
+        depth_mm=(mm[0], mm[1], mm[2]),
+        growth=growth,
+    )
+    against_bias, against_move = "", _of_markers(figures)
+    if _is_worse(recorded, alone, block):
+        against_bias = f"held-out depth agrees no better without its bias: {mm[0]:.3g} mm before, {mm[1]:.3g} mm after"
+    if not against_move and (_is_worse(alone, moved, block) or _is_worse(recorded, moved, block)):
+        against_move = (
+            f"held-out depth agrees no better with moved poses: {min(mm[:2]):.3g} mm before, {mm[2]:.3g} mm after"
+        )
+    return Trial(figures=figures, against_bias=against_bias, against_move=against_move)
 
 
 def _compared(
@@ -92,25 +162,58 @@ def _compared(
     floor: tuple[Array, float] | None,
     held: NDArray[np.bool_],
     sizes: tuple[float, float],
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Held-out markers (loss, squares) and tiles (loss, distance [m], block): before and after depth has its say."""
+) -> _Compared:
+    """Held-out markers and tiles, before depth has its say, when it corrects itself alone, and when poses move."""
     known = tiles.target == FLOOR
     known[~known] = half.trained[tiles.target[~known]]
     train, test = tiles.only(mine & known), tiles.only(~mine & known)
-    start = start_estimate(half.train, floor)
-    nothing, (scale, lean_px) = np.ones_like(held), sizes
-    before = fuse(half.train, train, sensors, start, lean_px=0.0, fixed_bias=nothing, fixed_poses=True, scale=scale)
-    after = fuse(half.train, train, sensors, start, lean_px=lean_px, fixed_bias=held, scale=scale)
-    markers, depth = [], []
-    for at in (before, after):
-        seen = half.held_out(at.T_world_cam, at.T_world_target)
-        markers.append(np.stack([seen.cost, seen.squares_px2], axis=1))
-        e = np.nan_to_num(residuals(test, at, sensors, half.train), nan=np.inf)
-        loss = np.log1p(np.minimum((e / scale / KAPPA) ** 2, 1e6))
-        depth.append(
-            np.stack([loss, np.abs(e) * test.sigma / test.inverse**2, test.camera * 2.0**32 + test.block], axis=1)
-        )
-    return (markers[0], markers[1]), (depth[0], depth[1])
+    start, nothing, (scale, lean_px) = start_estimate(half.train, floor), np.ones_like(held), sizes
+    start = replace(start, scale=scale)
+    moved = fuse(half.train, train, sensors, start, lean_px=lean_px, fixed_bias=held, scale=scale)
+    estimates = (
+        without_lean(half.train, train, sensors, start, nothing),
+        without_lean(half.train, train, sensors, start, held),
+        without_lean(half.train, train, sensors, moved, held),
+    )
+    e = np.stack([np.nan_to_num(residuals(test, at, sensors, half.train), nan=np.inf) for at in estimates], axis=1)
+    return _Compared(
+        (
+            half.held_out(start.T_world_cam, start.T_world_target),
+            half.held_out(moved.T_world_cam, moved.T_world_target),
+        ),
+        np.log1p(np.minimum((e / scale / KAPPA) ** 2, 1e6)),
+        np.abs(e) * (test.sigma / test.inverse**2)[:, None],
+        test.camera * 2.0**32 + test.block,
+    )
+
+
+def _growth(compared: Sequence[_Compared], camera: int) -> Growth:
+    """Of the squares of one camera's held-out corners; those that were far off anyway count little."""
+    n, squares, variance = 0, 0.0, 0.0
+    for half in compared:
+        mine = half.markers[0].camera == camera
+        r, after = (k.off[mine] for k in half.markers)
+        weight = 1.0 / (1.0 + (r**2).sum(axis=1) / KAPPA**2)
+        n += len(np.unique(half.markers[0].marker[mine]))
+        squares += float(weight @ ((after**2).sum(axis=1) - (r**2).sum(axis=1)))
+        variance += 4.0 * float(weight @ ((after - r) ** 2).sum(axis=1))
+    return Growth(n_markers=n, squares=squares, chance=math.sqrt(variance))
+
+
+def _of_markers(figures: HeldOut) -> str:
+    """Whose markers the move predicts worse, or all together, in words; empty if none."""
+    worse = [name for name, growth in figures.growth.items() if growth.is_worse]
+    every = figures.growth.values()
+    together = Growth(
+        n_markers=figures.n_markers,
+        squares=sum(g.squares for g in every),
+        chance=math.sqrt(sum(g.chance**2 for g in every)),
+    )
+    if not worse and not together.is_worse:
+        return ""
+    whose = f" of {', '.join(f'camera {name}' for name in worse)}" if worse else ""
+    px = figures.marker_px
+    return f"held-out markers{whose} are predicted worse with depth: {px[0]:.3g} px before, {px[1]:.3g} px after"
 
 
 def _is_odd(tiles: Tiles) -> NDArray[np.bool_]:
@@ -129,7 +232,11 @@ def _is_worse(before: Array, after: Array, group: Array) -> bool:
     return total > SIGNIFICANT * error and total > NOTICEABLE * float(before.sum())
 
 
-def _rms(squares: Array) -> float:
+def _rms(parts: Sequence[HeldOutMarkers]) -> float:
+    """Over all markers, each of which counts by the mean square of its corners."""
+    sums = [np.bincount(part.marker, (part.off_px**2).sum(axis=1)) for part in parts]
+    counts = [np.bincount(part.marker) for part in parts]
+    squares = np.concatenate([np.empty(0), *(s[n > 0] / n[n > 0] for s, n in zip(sums, counts))])
     return float(np.sqrt(squares.mean())) if len(squares) else 0.0
 
 

@@ -50,6 +50,21 @@ class Fusion:
         left = np.linalg.slogdet(self.covariance[at, at])[1] - np.linalg.slogdet(prior)[1]
         return float(-np.expm1(left / 3.0))
 
+    @property
+    def floor_covariance(self) -> Array:
+        """(3, 3) of what the floor's own error does to all poses alike.
+
+        Of (turn about x [rad], turn about z [rad], rise along y [m]): components of the left perturbation of every
+        pose, in the axes and about the origin of the given world, whose floor is level.
+        """
+        up, axes = self.state.up, plane_axes(self.state.up)
+        M = np.zeros((3, 3))
+        # A floor that slopes more than estimated turns every camera back by n x up; its height is that at the pivot.
+        M[:2, :2] = np.cross(axes, up)[:, [0, 2]].T
+        M[2, :2] = -up[1] * (axes @ self.state.pivot)
+        M[2, 2] = -up[1]
+        return M @ self.covariance[:3, :3] @ M.T
+
     def part(self, camera: str) -> slice:
         """Where a camera stands in the covariance."""
         k = 3 + 3 * self.cameras.index(camera)

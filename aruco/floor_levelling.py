@@ -41,6 +41,7 @@ class Levelling:
     floor: FloorPlane  # the common floor in the given world
     moves: dict[str, FloorCorrection]  # of the cameras that see the floor
     covariances: dict[str, Array]  # (6, 6) of all cameras
+    floor_covariance: Array  # (3, 3) the part of these that all cameras share; see Fusion
     scales: dict[str, float]  # camera -> factor on the standard deviations of its pose
     bias_scale: float  # on those of all cameras' bias
 
@@ -147,6 +148,7 @@ def _levelling(attempt: _Attempt, moves: Mapping[str, FloorCorrection], covarian
         floor=fusion.floor.moved(invert_transform(attempt.T_level_world)),
         moves=dict(sorted(moves.items())),
         covariances={name: 0.5 * (new[name] + new[name].T) for name in level},
+        floor_covariance=fusion.floor_covariance,
         scales=fusion.scales.poses,
         bias_scale=fusion.scales.bias,
     )

@@ -125,7 +125,7 @@ def floor_samples(camera: str, data: Mapping[str, Any], stride: int) -> FloorSam
     bias = data.get("bias") or DepthBias()
     focal_baseline = float(K[0, 0]) * float(baseline) if baseline else bias.focal_baseline
     noise = DepthNoise(focal_baseline=focal_baseline)
-    drop = mask_edges(depth, focal_baseline=focal_baseline) | mask_grazing(depth, K)
+    drop = mask_edges(depth, focal_baseline=focal_baseline, focal_px=float(K[0, 0])) | mask_grazing(depth, K)
     drop |= _untrusted(data.get("confidence"), depth.shape, where)
     pixels, z = depth_samples(depth, K, stride, mask=~drop)
     true = bias.corrected(z)

@@ -25,6 +25,7 @@ from aruco.floor_correction import (
     compute_floor_correction,
     target_height,
 )
+from aruco.floor_doubts import FloorDoubts, floor_doubts
 from aruco.floor_levelling import Bounds, Levelling, level_world
 from aruco.floor_plane import (
     UP,
@@ -60,7 +61,7 @@ class GroundPlaneConfig:
     max_rotation_deg: float = MAX_ROTATION_DEG  # of one camera beyond the common motion
     max_translation_m: float = MAX_TRANSLATION_M
     ransac_threshold_m: float | None = None  # how far from a plane a point belongs to it; None: by the depth's noise
-    height_range: tuple[float, float] | None = None  # lowest and highest height of the floor in the given world [m]
+    height_range: tuple[float, float] | None = None  # of the floor along up in the given world, lowest and highest [m]
     stride: int = 4  # every so many rows and columns of the depth
     target_floor_y: float = 0.0
     seed: int = 0
@@ -104,8 +105,10 @@ class GroundPlaneMetrics:
     corrections: dict[str, FloorCorrection] = field(default_factory=dict)  # of every camera that sees the floor
     without_floor: dict[str, str] = field(default_factory=dict)  # camera -> why; these get the common motion only
     covariances: dict[str, Array] = field(default_factory=dict)  # camera -> (6, 6) of the returned pose
+    floor_covariance: Array | None = None  # (3, 3) of (turn about x, about z, rise) that all of these share; see Fusion
     pose_scales: dict[str, float] = field(default_factory=dict)  # camera -> factor on its pose's sigmas, by evidence
     bias_scale: float = 1.0  # on the sigmas of all cameras' bias
+    doubts: FloorDoubts = field(default_factory=FloorDoubts)  # cameras whose pose the floor contradicts
 
 
 def refine_ground_from_depth(
@@ -155,19 +158,20 @@ def refine_ground_from_depth(
     levelling = level_world(consensus, poses, covariances or {}, config.bounds, up)
     check_floor(levelling.floor, poses, up, target_points)
     logger.debug("floor: {} cameras, pose scales {}", len(consensus.planes), levelling.scales)
+    corrections = {name: _with_residuals(name, levelling, views[name], consensus, config) for name in levelling.moves}
     return levelling.T_world_cam, GroundPlaneMetrics(
         success=True,
         message=_message(levelling, len(poses)),
         camera_planes={name: p.in_world(levelling.T_world_cam[name]) for name, p in consensus.planes.items()},
         floor_before=levelling.floor,
         T_level_world=levelling.T_level_world,
-        corrections={
-            name: _with_residuals(name, levelling, views[name], consensus, config) for name in levelling.moves
-        },
+        corrections=corrections,
         without_floor={n: _why_not(n, views, consensus) for n in sorted(poses) if n not in consensus.planes},
         covariances=levelling.covariances,
+        floor_covariance=levelling.floor_covariance,
         pose_scales=levelling.scales,
         bias_scale=levelling.bias_scale,
+        doubts=floor_doubts(corrections, levelling.scales, (covariances or {}).keys()),
     )
 
 

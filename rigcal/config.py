@@ -56,10 +56,10 @@ class DepthConfig:
 
     save: bool = False  # pool it over time and hand it out
     verify: bool = False  # compare it with the target
-    refine: bool = False  # let it correct poses, and estimate its own bias
+    refine: bool = False  # estimate its bias, and let it correct poses, each where held-out data bear it out
     model: Literal["stereo", "offset"] = "stereo"  # of its bias
     baseline_m: float | None = None  # of stereo cameras whose recording does not say
-    max_rotation_deg: float = 5.0  # a camera that depth would move farther stays
+    max_rotation_deg: float = 5.0  # if depth would move any camera farther, all poses stay
     max_translation_m: float = 0.1
 
     def __post_init__(self) -> None:

@@ -65,14 +65,14 @@ def refine_with_depth(
 
     Args:
         average: Where the adjustment started.
-        joint: The adjusted rig; the result is in its world.
+        joint: The adjusted rig, with the cameras that are to take part; the result is in its world.
         evidence: What was seen.
         faces: Camera -> depth on the target.
         pooled: Camera -> its depth over time, for the floor; may be empty.
         model: Of the bias.
         baseline_m: Of cameras whose recording does not say.
-        max_rotation_deg: No camera is turned farther.
-        max_translation_m: Nor moved.
+        max_rotation_deg: If any camera were turned farther, no pose is moved.
+        max_translation_m: Likewise.
         known: Biases of cameras that an earlier calibration knows; their depth comes without them.
         seed: Taken for the sake of the other steps; halves are chosen by place, so nothing is left to chance.
 
@@ -102,10 +102,16 @@ def refine_with_depth(
             max_rotation_deg=max_rotation_deg,
             max_translation_m=max_translation_m,
         )
-    logger.info("depth {}: {}", "corrects the poses" if found.accepted else "corrects nothing", found.reason)
+    logger.info("depth corrects {}: {}", _corrects(found), found.reason)
     for name, finding in found.findings.items():
         logger.info("camera {}: {}", name, finding)
     return replace(found, T_world_target=_all_targets(found, markers, joint.rig, case))
+
+
+def _corrects(found: DepthRefinement) -> str:
+    if found.poses_accepted:
+        return "the poses"
+    return "its biases, not the poses" if found.bias_accepted else "nothing"
 
 
 def _case(average: RigEstimate, joint: JointRig, evidence: Evidence) -> tuple[Case, int | None]:
@@ -117,7 +123,9 @@ def _case(average: RigEstimate, joint: JointRig, evidence: Evidence) -> tuple[Ca
         return case, None
     if not case.moving:
         return case, 0
-    return case, case.sightings.frames.index(joint.rig.world_frame)
+    frames, world = case.sightings.frames, joint.rig.world_frame
+    # Cameras that take no part may have been the only ones to see it; any other frame carries the world as well.
+    return case, frames.index(world) if world in frames else 0
 
 
 def _measured_frames(case: Case, rig: RigEstimate, faces: Mapping[str, Sequence[FaceDepth]]) -> list[int]:
@@ -234,7 +242,7 @@ def _averaged(depth: CameraDepth) -> float:
 
 def _all_targets(found: DepthRefinement, markers: Markers, rig: RigEstimate, case: Case) -> dict[int, Array]:
     """The target of every frame of the rig, moved with the cameras that saw it."""
-    if not found.accepted:
+    if not found.poses_accepted:
         return dict(rig.T_world_target)
     T_world_cam = np.array([found.T_world_cam[camera.name] for camera in case.cameras])
     T_kept = np.array(list(found.T_world_target.values())).reshape(-1, 4, 4)

@@ -128,9 +128,7 @@ def _chosen_images(
     used = rig.cameras[camera.name].frames
     measured = set(recording.depth_indices(camera.name).tolist())
     frames = {
-        f: len(detections[f])
-        for f in used
-        if f in detections and images.get(f) in measured and f in rig.T_world_target
+        f: len(detections[f]) for f in used if f in detections and images.get(f) in measured and f in rig.T_world_target
     }
     return dict(sorted((images[f], f) for f in spread_frames(frames, at_most=at_most)))
 

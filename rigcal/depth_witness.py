@@ -1,6 +1,6 @@
 """What the rig's own depth says about a solved rig, and what it corrects.
 
-Owns      the order: compare depth with the target, correct poses by it if that is wished, compare again.
+Owns      the order: compare depth with the target, correct poses and depth by it if that is wished, compare again.
 Leaves    sampling to depth_samples, the comparison to aruco.depth_verify, the correction to depth_refining.
 """
 
@@ -35,7 +35,7 @@ class DepthTestimony:
     rig: RigEstimate
     covariance: Mapping[str, Array] = field(default_factory=dict)  # of cameras that were corrected
     agreement: Mapping[str, DepthAgreement] = field(default_factory=dict)  # of depth with the rig as it was
-    corrected: Mapping[str, DepthAgreement] = field(default_factory=dict)  # after the correction, if there was one
+    corrected: Mapping[str, DepthAgreement] = field(default_factory=dict)  # after a correction of poses or depth
     notes: Mapping[str, Any] = field(default_factory=dict)  # entries of _meta
 
 
@@ -47,7 +47,8 @@ def hear_depth(
     Args:
         average: Where the adjustment started.
         rig: The solved rig.
-        joint: Its adjustment; None where the average was kept, which nothing is corrected of.
+        joint: Its adjustment, maybe with cameras that the rig refuses; None where the average was kept, which nothing is
+            corrected of.
         evidence: With pooled depth.
         kept: Cameras that stay, with the biases that their file knows.
     """
@@ -61,7 +62,7 @@ def hear_depth(
         return DepthTestimony(rig=rig, agreement=before, notes={"depth_verified": _told(before)})
     refined = refine_with_depth(
         average,
-        joint,
+        replace(joint, rig=rig),
         evidence,
         {name: _unbiased(of_camera, known.get(name)) for name, of_camera in faces.items()},
         {name: _pooled_unbiased(depth, known.get(name)) for name, depth in evidence.pooled.items()},
@@ -73,10 +74,14 @@ def hear_depth(
         seed=evidence.config.seed,
     )
     notes = {"depth_verified": _told(before), "depth_refined": refined.as_dict()}
+    for name, why in refined.left_out.items():
+        logger.warning("camera {}: {}", name, why)
     if not refined.accepted:
         logger.warning("depth corrects nothing: {}", refined.reason)
         return DepthTestimony(rig=rig, agreement=before, notes=notes)
-    moved = _corrected(rig, refined)
+    if not refined.poses_accepted:
+        logger.warning("depth moves no pose: {}", refined.reason)
+    moved = _corrected(rig, refined) if refined.poses_accepted else rig
     found = {name: bias for name, bias in sorted(refined.biases.items()) if name not in known}
     biases = {**found, **known}
     after = _agreement(faces, moved, evidence, biases)

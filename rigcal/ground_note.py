@@ -1,6 +1,7 @@
 """What a levelled file says about its levelling under ``_meta.ground_refined``, and the same in words.
 
 Owns      the layout of the entry, and where the depth came from; nothing in it depends on time or place.
+Leaves    what is said of contradicted cameras to ground_doubts.
 """
 
 from __future__ import annotations
@@ -17,7 +18,11 @@ import numpy as np
 from aruco.ground_plane import FloorCorrection, FloorPlane, GroundPlaneConfig, GroundPlaneMetrics
 from aruco.pose_math import pose_text, rotation_angle
 from rigcal import __version__
+from rigcal.ground_doubts import GroundDoubts
 from rigcal.levelled_file import RigFile
+
+# What a file says of poses and views under its _meta, and levelling does not measure again.
+OF_GIVEN_POSES = ("adjusted", "depth_refined", "depth_verified", "kept", "quality")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +44,7 @@ def ground_note(
     source: DepthFile,
     metrics: GroundPlaneMetrics,
     partial: Mapping[str, str],
+    doubts: GroundDoubts,
     config: GroundPlaneConfig,
 ) -> dict[str, Any]:
     """The entry: the common motion, every camera's floor and correction, options and inputs."""
@@ -50,11 +56,15 @@ def ground_note(
             "raised_m": config.up[1] * float(metrics.T_level_world[1, 3]),
         },
         "floor_before": _plane(metrics.floor_before),
+        "floor_covariance": None if metrics.floor_covariance is None else metrics.floor_covariance.ravel().tolist(),
+        "contradicted": {"cameras": dict(doubts.cameras), "rig": doubts.rig},
         "pose_scales": {name: float(scale) for name, scale in sorted(metrics.pose_scales.items())},
+        "bias_scale": float(metrics.bias_scale),
         "cameras": {
             name: _correction(c, metrics.camera_planes.get(name)) for name, c in sorted(metrics.corrections.items())
         },
         "without_correction": dict(partial),
+        "still_of_the_given_poses": [key for key in OF_GIVEN_POSES if key in given.meta],
         "up_is_assumed": given.up_is_assumed,
         "depth_bias_applied": sorted(given.depth_bias.keys() & metrics.camera_planes.keys()),
         "provenance": {

@@ -17,7 +17,11 @@ from aruco.errors import InputError
 from aruco.model import UpAxis
 from aruco.pose_math import Array, Pose, pose_text
 from rigcal.formats import native
+from rigcal.ground_doubts import GroundDoubts, judged
 from rigcal.kept import kept_from_file
+
+# Figures of a camera that judge the pose which markers gave it, not the one that the floor has corrected.
+_OF_MARKERS = ("rms_px", "spread_mm", "spread_deg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,20 +99,23 @@ def levelled_content(
     T_world_cam: Mapping[str, Pose],
     covariance: Mapping[str, Array],
     note: Mapping[str, Any],
+    doubts: GroundDoubts,
     *,
     corrected: Collection[str],
 ) -> dict[str, Any]:
     """The content of the levelled file: all of the given one, but for what levelling has changed.
 
     Args:
-        given: The file that was levelled; what it says of views, residuals and verdict is still said of them.
+        given: The file that was levelled; what it says of views and residuals is still said, but as that of its poses.
         T_world_cam: Every camera's new pose.
         covariance: Of these, (6, 6); only cameras that the file had one of are written.
         note: ``_meta.ground_refined``.
+        doubts: What the floor contradicts.
         corrected: Cameras that were moved beyond the motion common to all.
     """
     entries = {
-        name: _entry(given.content[name], T, corrected=name in corrected) for name, T in sorted(T_world_cam.items())
+        name: _entry(given.content[name], T, doubts.cameras.get(name), corrected=name in corrected)
+        for name, T in sorted(T_world_cam.items())
     }
     world = given.meta.get("world")
     meta = {
@@ -117,13 +124,34 @@ def levelled_content(
         **given.meta,
         "world": {**(world if isinstance(world, dict) else {}), "up": native.UP_VECTORS[given.up], "origin": "floor"},
     }
+    if "quality" in meta:
+        meta["quality"] = judged(meta["quality"], doubts)
+    if isinstance(meta.get("aligned"), dict):
+        meta["aligned"] = _aligned(meta["aligned"], T_world_cam)
     if given.covariance:
         meta["covariance"] = {name: [float(x) for x in covariance[name].ravel()] for name in sorted(given.covariance)}
     return {**given.content, **entries, "_meta": {**meta, "ground_refined": dict(note)}}
 
 
-def _entry(entry: Mapping[str, Any], T_world_cam: Pose, *, corrected: bool) -> dict[str, Any]:
-    """A camera's entry without what the new pose makes untrue."""
+def _entry(
+    entry: Mapping[str, Any], T_world_cam: Pose, contradiction: str | None, *, corrected: bool
+) -> dict[str, Any]:
+    """A camera's entry without what the new pose makes untrue, and with what the floor says against it."""
     # A kept camera is no longer where its old file has it; what was least known of a pose the floor may know well.
-    untrue = {"kept", "least_known"} if corrected else {"kept"}
-    return {**{key: value for key, value in entry.items() if key not in untrue}, "pose": pose_text(T_world_cam)}
+    untrue = {"kept", "least_known", *_OF_MARKERS} if corrected else {"kept"}
+    new = {**{key: value for key, value in entry.items() if key not in untrue}, "pose": pose_text(T_world_cam)}
+    of_markers = {key: entry[key] for key in _OF_MARKERS if key in entry}
+    if corrected and of_markers:
+        new["before_levelling"] = of_markers
+    told = entry.get("warnings")
+    if contradiction is not None:
+        new["warnings"] = [*(told if isinstance(told, list) else []), contradiction]
+    return new
+
+
+def _aligned(about: Mapping[str, Any], T_world_cam: Mapping[str, Pose]) -> dict[str, Any]:
+    """How the world came upright, without the up of the markers, which is the floor's now."""
+    new = {key: value for key, value in about.items() if key != "up_in_target"}
+    if "camera_up" in new:
+        new["camera_up"] = {name: [float(-y) for y in T[:3, 1]] for name, T in sorted(T_world_cam.items())}
+    return new

@@ -16,7 +16,7 @@ from aruco.depth_mask import mask_edges
 from aruco.depth_noise import DepthNoise
 from aruco.ground_plane import GroundPlaneConfig, GroundPlaneMetrics
 from aruco.pose_math import Array, Pose
-from aruco.uncertainty import carried
+from rigcal.ground_doubts import GroundDoubts, ground_doubts
 from rigcal.ground_note import DepthFile, facts_of, ground_note
 from rigcal.levelled_file import RigFile, levelled_content
 from rigcal.report.floor_views import FloorFigures, FloorView, floor_figures, floor_view
@@ -44,8 +44,13 @@ class Levelling:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every camera was levelled on the floor that it sees itself."""
-        return not self.partial
+        """Whether every camera was levelled on the floor that it sees itself, and none is contradicted by it."""
+        return not self.partial and not self.doubts.cameras
+
+    @property
+    def doubts(self) -> GroundDoubts:
+        """What the floor contradicts."""
+        return ground_doubts(self.metrics, self.given.covariance.keys())
 
     @property
     def up_y(self) -> int:
@@ -65,31 +70,41 @@ class Levelling:
     @property
     def covariance(self) -> dict[str, Array]:
         """(6, 6) of the new poses of cameras whose file had one."""
-        new, T = self.metrics.covariances, self.metrics.T_level_world
-        return {name: new[name] if name in new else carried(S, T) for name, S in self.given.covariance.items()}
+        return {name: self.metrics.covariances[name] for name in self.given.covariance}
 
     @property
     def note(self) -> dict[str, Any]:
         """The entry ``_meta.ground_refined``."""
-        return ground_note(self.given, self.depth_file, self.metrics, self.partial, self.config)
+        return ground_note(self.given, self.depth_file, self.metrics, self.partial, self.doubts, self.config)
 
     @property
     def content(self) -> dict[str, Any]:
         """The new extrinsics file."""
         corrected = [name for name, c in self.metrics.corrections.items() if c.accepted]
-        return levelled_content(self.given, self.T_world_cam, self.covariance, self.note, corrected=corrected)
+        return levelled_content(
+            self.given, self.T_world_cam, self.covariance, self.note, self.doubts, corrected=corrected
+        )
 
     @property
     def facts(self) -> tuple[str, ...]:
         """Sentences about the whole rig."""
-        return facts_of(self.metrics, self.config)
+        doubt = self.doubts.rig
+        return *facts_of(self.metrics, self.config), *([doubt] if doubt else [])
 
     @property
     def figures(self) -> tuple[FloorFigures, ...]:
         """What is told of each camera."""
-        seen, why = self.metrics.corrections, self.partial
+        seen, why, doubts = self.metrics.corrections, self.partial, self.doubts.cameras
         return tuple(
-            floor_figures(name, T, self.T_world_cam[name], seen.get(name), reason=why.get(name, ""), up_y=self.up_y)
+            floor_figures(
+                name,
+                T,
+                self.T_world_cam[name],
+                seen.get(name),
+                reason=why.get(name, "" if name in self.doubts.shared else doubts.get(name, "")),
+                up_y=self.up_y,
+                doubtful=name in doubts,
+            )
             for name, T in self.T_before_cam.items()
         )
 
@@ -104,7 +119,7 @@ class Levelling:
         unbiased = data["bias"].corrected(depth) if "bias" in data else depth
         return floor_view(
             camera,
-            np.where(mask_edges(depth, focal_baseline=focal_baseline), np.nan, unbiased),
+            np.where(mask_edges(depth, focal_baseline=focal_baseline, focal_px=float(K[0, 0])), np.nan, unbiased),
             K,
             T_before_cam=T_before_cam,
             T_after_cam=self.T_world_cam[camera],

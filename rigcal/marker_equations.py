@@ -11,13 +11,14 @@ which the adjustment told.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aruco.depth_fusion import MarkerEquations
+from aruco.depth_fusion import MarkerEquations, inverse_over
 from aruco.depth_trial import HeldOutMarkers, MarkerHalf
 from aruco.pose_math import Array, Pose, exp_se3, invert_transform, log_se3
 from rigcal.solve.adjust import KAPPA, Adjustment, Gauge, adjust, blocks, by_frame, inverse_targets
@@ -97,7 +98,7 @@ def _missed_px(case: Case, found: Adjustment, gauge: Gauge) -> Array:
 def camera_covariance(equations: MarkerEquations) -> Array:
     """(6 c, 6 c) covariance of all cameras as the adjustment tells it; zero for those that may not move."""
     n = 6 * len(equations.cameras)
-    P = _inverse(equations.H, np.repeat(equations.free, 6))[:n, :n]
+    P = inverse_over(equations.H, np.repeat(equations.free, 6))[:n, :n]
     return P if equations.doubt is None else P + equations.doubt[:n] @ equations.doubt[:n].T
 
 
@@ -110,7 +111,6 @@ def _equations(case: Case, sightings: Sightings, kept: NDArray[np.int64], scaled
     H = _assembled(sightings, curved, extra, kept, gauge)[0]
     free = np.concatenate([~gauge.fixed_cameras, (seen & ~gauge.fixed_frames)[kept]])
     mask, m = np.repeat(free, 6), 6 * len(free)
-    P_corners = _inverse(H[:m, :m] / scaled.variance, mask)
     doubt = _of_shifts(A / scaled.variance, mask, scaled.missed_px)
     _, _, H_target, g_target, E = blocks(sightings, plain)
     inverse = inverse_targets(H_target, gauge)
@@ -121,7 +121,7 @@ def _equations(case: Case, sightings: Sightings, kept: NDArray[np.int64], scaled
             T_world_cam=poses.T_world_cam,
             T_world_target=poses.T_world_target[kept],
             free=free,
-            H=_inverse(P_corners, mask),
+            H=np.where(np.outer(mask, mask), H[:m, :m] / scaled.variance, 0.0),
             g=right[:m] / scaled.variance,
             doubt=doubt,
         ),
@@ -165,7 +165,7 @@ def _of_shifts(A: Array, free: NDArray[np.bool_], missed_px: Array) -> Array:
     """How far edges move the poses (m, c + 1): by shifts that are not known, and by those seen but not taken out."""
     m, n = len(free), len(missed_px)
     C = A[:m, m:]
-    response = -_inverse(A[:m, :m], free) @ C
+    response = -inverse_over(A[:m, :m], free) @ C
     prior = np.linalg.inv(SPREAD_PX**2 * np.eye(n) + COMMON_PX**2)
     left = np.linalg.inv(A[m:, m:] + C.T @ response + prior)
     return response @ np.column_stack([np.linalg.cholesky((left + left.T) / 2), missed_px])
@@ -173,20 +173,10 @@ def _of_shifts(A: Array, free: NDArray[np.bool_], missed_px: Array) -> Array:
 
 def _inflated(equations: MarkerEquations, beyond: Array, n_cam: int) -> MarkerEquations:
     free = np.repeat(equations.free, 6)
-    P = _inverse(equations.H, free)
+    P = inverse_over(equations.H, free)
     values, vectors = np.linalg.eigh((beyond + beyond.T) / 2)
     P[: 6 * n_cam, : 6 * n_cam] += (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return replace(equations, H=_inverse(P, free))
-
-
-def _inverse(A: Array, free: NDArray[np.bool_]) -> Array:
-    """Over the free coordinates, zero elsewhere: covariance from information, and back."""
-    out = np.zeros_like(A)
-    M = A[np.ix_(free, free)]
-    d = 1.0 / np.sqrt(np.maximum(np.diag(M), 1e-300))
-    inverse = np.linalg.pinv(M * np.outer(d, d), rcond=1e-13, hermitian=True) * np.outer(d, d)
-    out[np.ix_(free, free)] = (inverse + inverse.T) / 2
-    return out
+    return replace(equations, H=inverse_over(P, free))
 
 
 # --- halves ---------------------------------------------------------------------------------------------------------
@@ -229,16 +219,14 @@ def _half(
         train, test = case.sightings, only_corners(case.sightings, np.zeros(len(case.sightings.points), dtype=bool))
         markers = _equations(case, train, whole.kept, scaled)
     test = test.only_views(markers.seen[test.view_frame])
-    group = _groups(test)
+    camera, marker = test.view_camera[test.corner_view], _groups(test)
 
     def held_out(T_world_cam: Pose, T_world_target: Pose) -> HeldOutMarkers:
         poses = Poses(T_world_cam, markers.targets(T_world_cam, T_world_target))
-        r = np.nan_to_num(residuals(test, poses), nan=1e6)
-        squares = (r**2).sum(axis=1)
-        count = np.bincount(group)
-        cost = np.bincount(group, np.log1p(squares / scaled.kappa**2)).astype(np.float64)
-        squares_px2 = np.bincount(group, squares * test.sigma_px**2) / np.maximum(count, 1)
-        return HeldOutMarkers(cost=cost, squares_px2=squares_px2)
+        off = np.nan_to_num(residuals(test, poses), nan=1e6)
+        return HeldOutMarkers(
+            camera=camera, marker=marker, off=off / math.sqrt(scaled.variance), off_px=off * test.sigma_px[:, None]
+        )
 
     return MarkerHalf(train=markers.equations, trained=markers.seen[markers.kept], held_out=held_out)
 

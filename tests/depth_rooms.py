@@ -35,14 +35,16 @@ class Room:
     sensors: dict[str, DepthSensor]
 
     def halves(self) -> list[MarkerHalf]:
-        """Each half of the markers knows half as much, and held-out ones are a little off the truth, in twenty ways."""
+        """Each half of the markers knows half as much; held-out ones are off the truth by one sigma, in twenty ways."""
         half, rng = replace(self.markers, H=self.markers.H / 2), np.random.default_rng(0)
-        noise = 3.0 * rng.standard_normal((20, len(self.truth), 6))
+        n, k = len(self.truth), 20
+        noise = rng.standard_normal((k, n, 6))
 
         def held_out(T_world_cam: Pose, T_world_target: Pose) -> HeldOutMarkers:
-            off = [whitened(self.markers.H, c, T, t) for c, (T, t) in enumerate(zip(T_world_cam, self.truth))]
-            squares = ((np.array(off) + noise) ** 2).mean(axis=-1).ravel()
-            return HeldOutMarkers(cost=np.log1p(squares), squares_px2=squares)
+            at = [whitened(half.H, c, T, t) for c, (T, t) in enumerate(zip(T_world_cam, self.truth))]
+            off = (np.array(at) / np.sqrt(k) + noise).reshape(-1, 2)
+            marker = np.repeat(np.arange(k * n), 3)
+            return HeldOutMarkers(camera=marker % n, marker=marker, off=off, off_px=0.05 * off)
 
         return [MarkerHalf(train=half, trained=np.ones(1, dtype=bool), held_out=held_out)] * 2
 

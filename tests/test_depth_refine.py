@@ -192,28 +192,45 @@ def test_depth_corrects_what_markers_doubt_only_if_it_shows() -> None:
 def test_moves_beyond_the_bounds_are_refused_with_the_camera_and_the_size() -> None:
     room = box_room(np.random.default_rng(9))
     found = refined(room, max_translation_m=1e-5)
-    assert not found.accepted
+    assert not found.poses_accepted
     assert "camera c0" in found.reason
     assert "0.01 mm" in found.reason
-    assert found.biases == {}
+    # Biases do not depend on it.
+    assert found.bias_accepted
+    assert found.biases.keys() == set(room.markers.cameras)
     assert all((found.T_world_cam[n] == T).all() for n, T in zip(room.markers.cameras, room.markers.T_world_cam))
 
 
 def test_poses_that_predict_other_markers_worse_are_not_taken() -> None:
     room = box_room(np.random.default_rng(10))
 
-    def from_where_they_were(T_world_cam: Array, T_world_target: Array) -> HeldOutMarkers:
-        moved = np.array([np.abs(a - b).max() for a, b in zip(T_world_cam, room.markers.T_world_cam)])
-        return HeldOutMarkers(cost=1e-3 + np.repeat(moved, 3), squares_px2=np.repeat(moved, 3))
+    def only_c2_knows(T_world_cam: Array, T_world_target: Array) -> HeldOutMarkers:
+        """Every camera has one marker, and only that of c2 knows where its camera is: where it was."""
+        moved = 1e4 * np.abs(T_world_cam[2] - room.markers.T_world_cam[2]).max()
+        off = np.zeros((16, 2))
+        off[8:12] = moved
+        camera = np.repeat(np.arange(4), 4)
+        return HeldOutMarkers(camera=camera, marker=camera, off=off, off_px=0.05 * off)
 
-    halves = [replace(half, held_out=from_where_they_were) for half in room.halves()]
+    halves = [replace(half, held_out=only_c2_knows) for half in room.halves()]
     found = refine(room.markers, halves, room.tiles, room.sensors, FLOOR_PLANE)
-    assert not found.accepted
-    assert "held-out markers are predicted worse" in found.reason
+    assert not found.poses_accepted
+    assert "held-out markers of camera c2 are predicted worse" in found.reason
     assert found.held_out is not None
+    assert [growth.is_worse for growth in found.held_out.growth.values()] == [False, False, True, False]
+    assert found.as_dict()["cameras"]["c2"]["held_out_markers"]["n"] == 2
+    # Depth without its biases agrees better all the same, and poses stay to the bit.
+    assert found.bias_accepted
+    assert "poses stay" in found.reason
+    assert found.covariance == {}
+    assert all((found.T_world_cam[n] == T).all() for n, T in zip(room.markers.cameras, room.markers.T_world_cam))
+    for c, bias in enumerate(found.biases.values()):
+        assert abs(bias.scale - room.bias[c, 0]) < SCALE_TOLERANCE
+        assert bias.disparity_px is not None
+        assert abs(bias.disparity_px - FOCAL_BASELINE * room.bias[c, 1]) < DISPARITY_TOLERANCE_PX
     assert found.held_out.marker_px[1] > found.held_out.marker_px[0]
     # The same depth is believed by markers that agree with it.
-    assert refined(room).accepted
+    assert refined(room).poses_accepted
 
 
 def test_cameras_that_must_stay_do_so_to_the_bit() -> None:
@@ -368,10 +385,15 @@ def test_equations_of_markers_are_what_the_adjustment_knows() -> None:
         at = start_estimate(half.train, None)
         exact = half.held_out(at.T_world_cam, at.T_world_target)
         # 0.05 px a coordinate; the half that is tested is predicted by the other.
-        assert 0.03 < np.sqrt(exact.squares_px2.mean()) < 0.2
+        assert 0.03 < np.sqrt((exact.off_px**2).mean()) < 0.2
+        assert 0.8 < np.sqrt((exact.off**2).mean()) < 1.6
         bent = at.T_world_cam.copy()
         bent[0] = exp_se3(np.array([2e-3, 0, 0, 0, 0, 0])) @ bent[0]
-        assert half.held_out(bent, at.T_world_target).cost.sum() > 2 * exact.cost.sum()
+        after = half.held_out(bent, at.T_world_target)
+        worse = np.bincount(exact.camera, ((after.off**2) - exact.off**2).sum(axis=1))
+        # 2 mrad are more than a pixel; the other cameras have nothing to do with it.
+        assert worse[0] > 100
+        np.testing.assert_allclose(worse[1:], 0.0, atol=1e-6)
 
 
 def test_targets_that_depth_does_not_measure_follow_the_cameras() -> None:

@@ -13,7 +13,7 @@ from aruco.depth_noise import DepthNoise
 from aruco.ground_plane import FloorCorrection, FloorPlane
 from aruco.pose_math import Pose, exp_so3, make_pose
 from rigcal.report.floor_page import POINTS_A_CAMERA, DrawnWorld, heights_figure, maps_figure, rig_figure
-from rigcal.report.floor_views import FloorView, common_limit_mm, floor_figures, floor_view
+from rigcal.report.floor_views import FloorView, common_limit_mm, floor_figures, floor_view, told
 
 TRUE = cameras()["cam0"]
 OFF = tilted(TRUE, (0.5, 0.0), 0.03)
@@ -86,14 +86,23 @@ def test_figures_hold_every_camera_and_not_too_much() -> None:
     assert len(traces(maps_figure(views, world, 50.0))) == 2  # only the camera that sees the floor
 
 
+def test_what_rounds_to_zero_has_no_sign() -> None:
+    assert told(-0.04, "+.1f", " mm") == "0.0 mm"
+    assert told(0.0, "+.1f") == "0.0"
+    assert told(-0.0004, ".3f") == "0.000"
+    assert told(-0.06, "+.1f") == "-0.1"
+    assert told(1.23, "+.1f") == "+1.2"
+    assert told(math.nan, ".1f", " mm") == "-"
+
+
 def test_figures_of_one_camera_in_both_worlds() -> None:
     turn = make_pose(exp_so3(np.radians([0.3, 0.0, 0.0])), np.zeros(3))
     raised = make_pose(np.eye(3), np.array([0.0, 0.02, 0.0]))
     correction = FloorCorrection(tilt_before_deg=0.3, tilt_after_deg=0.0, height_before_m=-0.02, height_after_m=0.0)
-    told = floor_figures("a", TRUE, raised @ turn @ TRUE, correction, reason="", up_y=1)
-    assert told.turned_deg == pytest.approx(0.3)
-    assert told.height_before_mm == pytest.approx(-20)
+    figures = floor_figures("a", TRUE, raised @ turn @ TRUE, correction, reason="", up_y=1)
+    assert figures.turned_deg == pytest.approx(0.3)
+    assert figures.height_before_mm == pytest.approx(-20)
     down = floor_figures("a", TURN @ TRUE, TURN @ raised @ TRUE, None, reason="why", up_y=-1)
     assert down.raised_mm == pytest.approx(20)
     assert math.isnan(down.tilt_before_deg)
-    assert (told.told, down.told) == ("levelled", "whole rig only: why")
+    assert (figures.told, down.told) == ("levelled", "whole rig only: why")

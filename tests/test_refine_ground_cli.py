@@ -31,6 +31,7 @@ from floor_rooms import (
 from aruco.depth_bias import DepthBias
 from aruco.depth_save import CameraDepth, save_depth_data
 from aruco.pose_math import Pose, exp_so3, make_pose, pose_distance, pose_text
+from aruco.uncertainty import carried
 from refine_ground_plane import main
 from rigcal.formats.native import read_poses, write_json
 
@@ -48,24 +49,30 @@ def given_poses(T_world_cam: Mapping[str, Pose] = ROUGH) -> dict[str, Pose]:
     return {name: T_TARGET_ROOM @ T for name, T in T_world_cam.items()}
 
 
-def document(T_world_cam: Mapping[str, Pose], **meta: Any) -> dict[str, Any]:
-    """The content of an extrinsics file of an upright world; entries of meta come on top."""
+def document(T_world_cam: Mapping[str, Pose], at_centre: np.ndarray = ROUGH_COVARIANCE, **meta: Any) -> dict[str, Any]:
+    """The content of an extrinsics file of an upright world; entries of meta come on top.
+
+    Args:
+        T_world_cam: Its poses.
+        at_centre: (6, 6) covariance of (turn, shift of the centre) of each.
+        meta: Under ``_meta``.
+    """
     about = {
         "format": "rigcal.extrinsics",
         "version": 1,
         "world": {"up": [0, 1, 0], "origin": "target"},
-        "covariance": {name: [float(x) for x in at(T).ravel()] for name, T in T_world_cam.items()},
+        "covariance": {name: [float(x) for x in at(T, at_centre).ravel()] for name, T in T_world_cam.items()},
         **meta,
     }
     return {**{name: {"pose": pose_text(T)} for name, T in T_world_cam.items()}, "_meta": about}
 
 
-def at(T_world_cam: Pose) -> np.ndarray:
-    """ROUGH_COVARIANCE of turn and centre as a covariance of the left perturbation in the world's axes."""
+def at(T_world_cam: Pose, at_centre: np.ndarray = ROUGH_COVARIANCE) -> np.ndarray:
+    """A covariance of turn and centre as one of the left perturbation in the world's axes."""
     J = np.eye(6)
     c = T_world_cam[:3, 3]
     J[3:, :3] = [[0, c[2], -c[1]], [-c[2], 0, c[0]], [c[1], -c[0], 0]]  # v = shift of the centre - omega x c
-    return J @ ROUGH_COVARIANCE @ J.T
+    return J @ at_centre @ J.T
 
 
 @pytest.fixture(scope="module")
@@ -254,6 +261,8 @@ def test_two_floors_are_not_mixed(rig: Path, tmp_path: Path) -> None:
 def test_what_stays_true_stays_and_what_does_not_goes(rig: Path, store: Path, tmp_path: Path) -> None:
     def more(content: dict[str, Any]) -> None:
         content["cam0"] |= {"frames": 7, "kept": True, "least_known": "roll of camera cam0", "colour": "blue"}
+        content["cam0"] |= {"rms_px": 0.1, "spread_mm": 0.2, "spread_deg": 0.01, "warnings": ["a single view"]}
+        content["_meta"]["aligned"] = {"is_guess": False, "up_in_target": [0, 1, 0], "camera_up": {"cam0": [0, 1, 0]}}
         content["_note"] = "by hand"
         content["_meta"] |= {"quality": {"verdict": "good"}, "mine": [1, 2]}
         del content["_meta"]["covariance"]["cam1"]
@@ -269,7 +278,16 @@ def test_what_stays_true_stays_and_what_does_not_goes(rig: Path, store: Path, tm
     assert "least_known" not in entry
     assert content["_note"] == "by hand"
     assert content["_meta"]["mine"] == [1, 2]
-    assert content["_meta"]["quality"] == {"verdict": "good"}
+    # Reprojection and spread are those of a pose that is no longer the camera's, and so is the verdict.
+    assert not entry.keys() & {"rms_px", "spread_mm", "spread_deg"}
+    assert entry["before_levelling"] == {"rms_px": 0.1, "spread_mm": 0.2, "spread_deg": 0.01}
+    assert entry["warnings"] == ["a single view"]
+    assert content["_meta"]["quality"]["verdict"] == "good"
+    assert "before levelling" in content["_meta"]["quality"]["reasons"][-1]
+    assert content["_meta"]["ground_refined"]["still_of_the_given_poses"] == ["quality"]
+    assert content["_meta"]["aligned"].keys() == {"is_guess", "camera_up"}
+    for name, T in read_poses(tmp_path / "level.json").items():
+        assert np.allclose(content["_meta"]["aligned"]["camera_up"][name], -T[:3, 1], atol=1e-12)
     # Nobody knew how well cam1's pose was known; the floor alone does not say it.
     assert sorted(content["_meta"]["covariance"]) == ["cam0", "cam2", "cam3"]
     assert content["_meta"]["covariance"]["cam0"] != given["_meta"]["covariance"]["cam0"]
@@ -386,6 +404,87 @@ def test_a_camera_that_contradicts_the_others_is_named_and_not_forced(rig: Path,
     # The others are as right as without it.
     errors = floor_errors(TRUE, read_poses(tmp_path / "level.json"))
     assert max(tilt for name, (tilt, _) in errors.items() if name != "cam1") < 0.1
+
+
+# What markers promise of good poses, and what they do not know of: a camera that somebody has pushed.
+GOOD_COVARIANCE = np.diag([math.radians(0.03) ** 2] * 3 + [0.001**2] * 3)
+GOOD_POSES = nudged(TRUE, degrees=0.03, mm=1.0, seed=1)
+
+
+def judged_rig(path: Path, T_world_cam: Mapping[str, Pose], **meta: Any) -> Path:
+    quality = {"verdict": "good", "reasons": ["All is well."], "checks": []}
+    write_json(path, document(given_poses(T_world_cam), GOOD_COVARIANCE, quality=quality, **meta))
+    return path
+
+
+def test_a_camera_moved_since_its_calibration_is_named_everywhere(store: Path, tmp_path: Path) -> None:
+    pushed = {**GOOD_POSES, "cam1": tilted(GOOD_POSES["cam1"], (3.0, 0.0), 0.06)}
+    rig = judged_rig(tmp_path / "rig.json", pushed)
+    result = level(rig, store, tmp_path / "level.json", "--plot")
+    # Within the bounds, so it is levelled; but what made it that wrong has spoilt its yaw and place too.
+    assert result.exit_code == 3, result.output
+    said = [line for line in result.output.splitlines() if "camera cam1: its floor is 3.0 degrees and" in line]
+    assert len(said) == 1, result.output
+    assert "times what its covariance promises" in said[0]
+    assert "calibrate again" in said[0]
+    content = json.loads((tmp_path / "level.json").read_text())
+    assert content["cam1"]["warnings"] == [content["_meta"]["ground_refined"]["contradicted"]["cameras"]["cam1"]]
+    assert not any("warnings" in content[name] for name in TRUE if name != "cam1")
+    assert list(content["_meta"]["ground_refined"]["contradicted"]["cameras"]) == ["cam1"]
+    assert content["_meta"]["ground_refined"]["pose_scales"]["cam1"] > 20
+    assert content["_meta"]["ground_refined"]["pose_scales"]["cam0"] < 3
+    quality = content["_meta"]["quality"]
+    assert (quality["verdict"], quality["verdict_before_levelling"]) == ("bad", "good")
+    assert quality["reasons"][0].startswith("Camera cam1: its floor is 3.0 degrees")
+    assert "levelled, doubtful" in (tmp_path / "level.html").read_text()
+
+
+def test_a_rig_whose_floors_all_disagree_is_not_good(store: Path, tmp_path: Path) -> None:
+    rig = judged_rig(tmp_path / "rig.json", nudged(TRUE, degrees=0.6, mm=12.0, seed=2))
+    result = level(rig, store, tmp_path / "level.json")
+    assert result.exit_code == 3, result.output
+    said = [line for line in result.output.splitlines() if line.startswith("The floors of cameras cam0, cam1,")]
+    assert len(said) == 1, result.output
+    assert "--refine-depth" in said[0]
+    assert "camera cam0: its floor" not in result.output  # one sentence, not five
+    content = json.loads((tmp_path / "level.json").read_text())
+    assert content["_meta"]["ground_refined"]["contradicted"]["rig"] == said[0]
+    assert content["_meta"]["quality"]["verdict"] in ("usable", "bad")
+    assert content["_meta"]["quality"]["reasons"][:2] == [said[0], "All is well."]
+    assert all("calibrate again" in content[name]["warnings"][0] for name in TRUE)
+
+
+def test_poses_as_good_as_they_say_are_not_doubted(rig: Path, store: Path, tmp_path: Path) -> None:
+    # Good ones, rough ones that say so, and ones that say nothing and are within what poses without a word may be.
+    rough = {**ROUGH, "cam1": tilted(ROUGH["cam1"], (0.8, 0.0), 0.01)}
+    write_json(tmp_path / "silent.json", document(given_poses(rough)))
+    change(tmp_path / "silent.json", lambda content: content["_meta"].pop("covariance"))
+    for given in (judged_rig(tmp_path / "good.json", GOOD_POSES), rig, tmp_path / "silent.json"):
+        content = levelled(given, store, tmp_path / "level.json")
+        assert content["_meta"]["ground_refined"]["contradicted"] == {"cameras": {}, "rig": ""}
+        assert content["_meta"].get("quality", {"verdict": "good"})["verdict"] == "good"
+
+
+def test_a_rejected_correction_takes_the_verdict_down(store: Path, tmp_path: Path) -> None:
+    rig = judged_rig(tmp_path / "rig.json", {**GOOD_POSES, "cam1": tilted(GOOD_POSES["cam1"], (6.5, 0.0))})
+    content = levelled(rig, store, tmp_path / "level.json", code=3)
+    assert content["_meta"]["quality"]["verdict"] == "bad"
+    assert "--max-rotation-deg" in content["cam1"]["warnings"][0]
+
+
+def test_the_part_of_the_covariances_that_all_cameras_share_is_told(rig: Path, tmp_path: Path) -> None:
+    # cam2 sees nothing: its error is its own and, on top of it, the floor's.
+    three = store_of(tmp_path / "three.h5", {n: d for n, d in depth_of(TRUE).items() if n != "cam2"})
+    content = levelled(rig, three, tmp_path / "level.json", code=3)
+    note = content["_meta"]["ground_refined"]
+    T_level_world = np.array([float(x) for x in note["common_motion"]["T_level_world"].split()]).reshape(4, 4)
+    own = carried(at(given_poses()["cam2"]), T_level_world)
+    after = np.array(content["_meta"]["covariance"]["cam2"]).reshape(6, 6)
+    S = np.array(note["floor_covariance"]).reshape(3, 3)
+    seen = [0, 2, 4]  # turn about x, turn about z, rise
+    assert np.allclose((after - own)[np.ix_(seen, seen)], S, rtol=1e-6, atol=1e-15)
+    # Three poses known to 0.6 degrees make a floor known to some 0.3.
+    assert 0.1 < math.degrees(math.sqrt(S[0, 0])) < 0.6
 
 
 def test_depth_of_an_unknown_camera_is_left_aside(rig: Path, tmp_path: Path) -> None:
@@ -604,3 +703,4 @@ def test_help_answers_at_once() -> None:
                    "--plot-output", "--max-rotation-deg", "--max-translation-m", "--ransac-threshold",
                    "--height-range", "--stride", "--target-floor-y", "--seed", "--debug"):  # fmt: skip
         assert option in out
+    assert "counted along up" in " ".join(out.split())

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from aruco.pose_math import Array, transform_points
-from rigcal.report.floor_views import FloorFigures, FloorView, common_limit_mm
+from rigcal.report.floor_views import FloorFigures, FloorView, common_limit_mm, told
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -103,12 +103,12 @@ def figures_table(figures: Sequence[FloorFigures]) -> str:
     rows = [
         (
             escape(f.camera),
-            _number(f.tilt_before_deg, ".3f", "°"),
-            _number(f.tilt_after_deg, ".3f", "°"),
-            _number(f.height_before_mm, "+.1f", " mm"),
-            _number(f.height_after_mm, "+.1f", " mm"),
-            _number(f.turned_deg, ".3f", "°"),
-            _number(f.raised_mm, "+.1f", " mm"),
+            told(f.tilt_before_deg, ".3f", "°"),
+            told(f.tilt_after_deg, ".3f", "°"),
+            told(f.height_before_mm, "+.1f", " mm"),
+            told(f.height_after_mm, "+.1f", " mm"),
+            told(f.turned_deg, ".3f", "°"),
+            told(f.raised_mm, "+.1f", " mm"),
             escape(f.told),
         )
         for f in figures
@@ -116,10 +116,6 @@ def figures_table(figures: Sequence[FloorFigures]) -> str:
     header = "".join(f"<th>{name}</th>" for name in head)
     body = "\n".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><thead><tr>{header}</tr></thead><tbody>\n{body}\n</tbody></table>"
-
-
-def _number(value: float, form: str, unit: str) -> str:
-    return "-" if math.isnan(value) else f"{value:{form}}{unit}"
 
 
 def rig_figure(views: Sequence[FloorView], colours: Mapping[str, str], world: DrawnWorld) -> go.Figure:

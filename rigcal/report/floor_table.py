@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from rigcal.report.floor_views import FloorFigures
+from rigcal.report.floor_views import FloorFigures, told
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,12 +25,12 @@ def show_levelling(out: Console, figures: Sequence[FloorFigures], facts: Sequenc
     for f in figures:
         table.add_row(
             escape(f.camera),
-            _told(f.tilt_before_deg, ".3f"),
-            _told(f.tilt_after_deg, ".3f"),
-            _told(f.height_before_mm, "+.1f"),
-            _told(f.height_after_mm, "+.1f"),
-            _told(f.turned_deg, ".3f"),
-            _told(f.raised_mm, "+.1f"),
+            told(f.tilt_before_deg, ".3f"),
+            told(f.tilt_after_deg, ".3f"),
+            told(f.height_before_mm, "+.1f"),
+            told(f.height_after_mm, "+.1f"),
+            told(f.turned_deg, ".3f"),
+            told(f.raised_mm, "+.1f"),
             escape(f.outcome),
         )
     out.print(table)
@@ -40,7 +39,3 @@ def show_levelling(out: Console, figures: Sequence[FloorFigures], facts: Sequenc
             out.print(f"{f.outcome}: camera {f.camera}: {f.reason}", markup=False)
     for fact in facts:
         out.print(fact, markup=False)
-
-
-def _told(value: float, form: str) -> str:
-    return "-" if math.isnan(value) else f"{value:{form}}"

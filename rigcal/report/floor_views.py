@@ -109,7 +109,7 @@ class FloorFigures:
     turned_deg: float
     raised_mm: float
     outcome: str  # in a word or two
-    reason: str = ""  # why it was not levelled on its own floor
+    reason: str = ""  # why it was not levelled on its own floor, or why that is doubtful
 
     @property
     def told(self) -> str:
@@ -118,7 +118,14 @@ class FloorFigures:
 
 
 def floor_figures(
-    camera: str, T_before_cam: Pose, T_after_cam: Pose, correction: FloorCorrection | None, *, reason: str, up_y: int
+    camera: str,
+    T_before_cam: Pose,
+    T_after_cam: Pose,
+    correction: FloorCorrection | None,
+    *,
+    reason: str,
+    up_y: int,
+    doubtful: bool = False,
 ) -> FloorFigures:
     """The figures of one camera.
 
@@ -127,8 +134,9 @@ def floor_figures(
         T_before_cam: Its pose as if only the whole rig had been moved.
         T_after_cam: Its final pose.
         correction: What its floor asked for; None if it sees none.
-        reason: Why it was not levelled on its own floor; empty if it was.
+        reason: Why it was not levelled on its own floor, or why that is doubtful; else empty.
         up_y: 1 if y points up, -1 if down.
+        doubtful: Whether its floor contradicts its pose.
     """
     turned_rad, _ = pose_distance(T_before_cam, T_after_cam)
     seen = correction or FloorCorrection()
@@ -140,9 +148,25 @@ def floor_figures(
         height_after_mm=1e3 * seen.height_after_m,
         turned_deg=math.degrees(turned_rad),
         raised_mm=1e3 * up_y * float(T_after_cam[1, 3] - T_before_cam[1, 3]),
-        outcome="levelled" if not reason else "whole rig only" if correction is None else "rejected",
+        outcome=_outcome(correction, doubtful=doubtful),
         reason=reason,
     )
+
+
+def _outcome(correction: FloorCorrection | None, *, doubtful: bool) -> str:
+    if correction is None:
+        return "whole rig only"
+    if not correction.accepted:
+        return "rejected"
+    return "levelled, doubtful" if doubtful else "levelled"
+
+
+def told(value: float, form: str, unit: str = "") -> str:
+    """A number for a table; what rounds to zero has no sign, NaN is a dash."""
+    if math.isnan(value):
+        return "-"
+    text = f"{value:{form}}"
+    return (text if float(text) else text.lstrip("+-")) + unit
 
 
 def common_limit_mm(views: Sequence[FloorView], up_y: int, floor_y: float) -> float:
