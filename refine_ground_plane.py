@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,18 @@ import click
 
 if TYPE_CHECKING:
     from rigcal.levelled_rig import Levelling
+
+
+class Finite(click.FloatRange):
+    """A range of numbers, which NaN is not in."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number; wrong usage if it is none or out of the range."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
+
 
 PARTIAL = 3  # exit code: written, but not every camera was levelled on a floor that it sees itself
 
@@ -28,18 +41,18 @@ PARTIAL = 3  # exit code: written, but not every camera was levelled on a floor 
                    "Default: only if --plot-output is given.")  # fmt: skip
 @click.option("--plot-output", type=click.Path(path_type=Path), metavar="FILE.html",
               help="Where the page goes. Default: beside the output, named after it.")  # fmt: skip
-@click.option("--max-rotation-deg", type=float, default=5.0, show_default=True, metavar="DEG",
+@click.option("--max-rotation-deg", type=Finite(0, 90, min_open=True), default=5.0, show_default=True, metavar="DEG",
               help="How far one camera may be turned against the others; more is refused.")  # fmt: skip
-@click.option("--max-translation-m", type=float, default=0.1, show_default=True, metavar="M",
+@click.option("--max-translation-m", type=Finite(0, 10, min_open=True), default=0.1, show_default=True, metavar="M",
               help="How far one camera may be raised or lowered against the others.")  # fmt: skip
-@click.option("--ransac-threshold", type=float, metavar="M",
+@click.option("--ransac-threshold", type=Finite(0, 1, min_open=True), metavar="M",
               help="How near a plane depth must be to be part of it. Default: by the noise of depth.")  # fmt: skip
-@click.option("--height-range", type=float, nargs=2, metavar="MIN MAX",
+@click.option("--height-range", type=Finite(-1000, 1000), nargs=2, metavar="MIN MAX",
               help="Look for the floor only between these heights of the input's world [m], counted along up: "
                    "where y points down, the height of a point is -y.")  # fmt: skip
 @click.option("--stride", type=click.IntRange(min=1), default=4, show_default=True, metavar="N",
               help="Use every Nth row and column of the depth.")  # fmt: skip
-@click.option("--target-floor-y", type=float, default=0.0, show_default=True, metavar="M",
+@click.option("--target-floor-y", type=Finite(-1000, 1000), default=0.0, show_default=True, metavar="M",
               help="Where the floor is put on the y axis.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="For every random choice.")
 @click.option("--debug", is_flag=True, help="Say more about what happens.")
@@ -55,6 +68,9 @@ def main(**given: Any) -> None:
     """
     if given["plot"] is False and given["plot_output"]:
         raise click.UsageError("--plot-output names a page that --no-plot forbids: give one of them")
+    heights = given["height_range"]
+    if heights and heights[0] >= heights[1]:
+        raise click.UsageError("--height-range wants the lower height first")
     from rigcal import cli
 
     with cli.telling_errors(debug=given["debug"]):

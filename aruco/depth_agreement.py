@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from aruco.depth_bias import DepthBias
+from aruco.depth_tiles import FACE_UNEVEN_M
 from aruco.depth_trends import Trend, Trends
 from aruco.depth_words import findings, judgement
 from aruco.pose_math import Array
@@ -46,9 +47,19 @@ class DepthErrors:
         return float(np.sqrt(np.mean(self.errors_m**2))) if len(self) else math.nan
 
     @property
+    def rmse_of_most_m(self) -> float:
+        """That of the nine tenths of the places that agree best: the others may lie on edges, or on something else."""
+        best = np.sort(np.abs(self.errors_m))[: math.ceil(0.9 * len(self))]
+        return float(np.sqrt(np.mean(best**2))) if len(self) else math.nan
+
+    @property
     def normalised(self) -> float:
         """The root mean square of errors in sigmas: about 1 where noise explains them, more with a bias."""
         return float(np.sqrt(np.mean((self.errors_m / self.sigma_m) ** 2))) if len(self) else math.nan
+
+    def explained_m(self, uneven_m: float) -> float:
+        """The root mean square error that noise makes, and a surface that is no plane."""
+        return float(np.sqrt(np.mean(self.sigma_m**2 + uneven_m**2))) if len(self) else math.nan
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; null where there is nothing."""
@@ -109,7 +120,9 @@ class DepthAgreement:
                 "depth and confidence images."
             )
         level = (self.faces.median_m, self.faces.median_share)
-        said = judgement(level, self.range_m, self.trends, corrected=self.bias is not None)
+        explained_m = self.faces.explained_m(FACE_UNEVEN_M)
+        rmse = (self.faces.rmse_m, self.faces.rmse_m / explained_m, self.faces.rmse_of_most_m / explained_m)
+        said = judgement(level, rmse, self.range_m, self.trends, corrected=self.bias is not None)
         return f"camera {self.camera}: {said}"
 
     def as_dict(self) -> dict[str, Any]:

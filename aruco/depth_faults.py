@@ -32,6 +32,7 @@ _CHECK = (
     "it takes no part and gets no bias: check that its depth images are its own and not mirrored, depth_scale and "
     "unit, and the depth's intrinsics and baseline"
 )
+_CHECK_LEAN = "it gets no bias; check its rectification, and that the depth's intrinsics are its own"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +59,16 @@ def worst_fault(
     return max((fault for fault in faults if fault.excess > 1.0), key=lambda fault: fault.excess, default=None)
 
 
+def indescribable(written: Estimate, markers: MarkerEquations, sensors: Mapping[str, DepthSensor]) -> dict[int, str]:
+    """Cameras (indices) whose biases only serve to stand for leans, where nothing else may be taken out; and why."""
+    found = {c: _sigmas(written.bias[c], sensors[name]) for c, name in enumerate(markers.cameras)}
+    return {
+        c: f"two numbers do not describe how its depth is wrong, which leans across the image: {_CHECK_LEAN}"
+        for c, sigmas in found.items()
+        if sigmas > MAX_OF_PRIOR
+    }
+
+
 def _of_residuals(camera: int, e: Array, tiles: Tiles, usual: float) -> Fault:
     """From residuals (n,) of a camera's tiles on the target, in standard deviations."""
     best = np.argsort(np.abs(e))[: math.ceil(TRUSTED_SHARE * len(e))]
@@ -71,9 +82,14 @@ def _of_residuals(camera: int, e: Array, tiles: Tiles, usual: float) -> Fault:
 
 def _of_bias(camera: int, bias: Array, sensor: DepthSensor) -> Fault:
     """From a bias (2,) that was fitted."""
-    sigmas = math.sqrt(float(bias @ np.linalg.solve(sensor.prior, bias)))
+    sigmas = _sigmas(bias, sensor)
     said = f"depth would need a bias {sigmas:.1f} times as large as is usual ({_named(sensor, bias)}), so {_CHECK}"
     return Fault(camera=camera, excess=sigmas / MAX_OF_PRIOR, said=said)
+
+
+def _sigmas(bias: Array, sensor: DepthSensor) -> float:
+    """How far from its prior a bias (2,) is."""
+    return math.sqrt(float(bias @ np.linalg.solve(sensor.prior, bias)))
 
 
 def _named(sensor: DepthSensor, bias: Array) -> str:

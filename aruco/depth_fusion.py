@@ -143,7 +143,7 @@ def fuse(
     held = np.zeros((n_cam, 2), dtype=bool) if fixed_bias is None else fixed_bias
     leans = np.full(2 * n_cam, lean_px > 0)
     free = np.concatenate([poses, ~held.ravel(), leans, np.full(3, start.floor is not None)])
-    at, said = start, scale or 1.0
+    at, said = replace(start, bias=np.where(held, 0.0, start.bias)), scale or 1.0
     for _ in range(MAX_STEPS):
         e, J = problem.rows(at)
         if scale is None:
@@ -165,7 +165,7 @@ def without_lean(
 
     Whoever corrects depth later has these two numbers a camera alone.
     """
-    start = replace(at, bias=np.where(held, 0.0, at.bias), lean=np.zeros_like(at.lean))
+    start = replace(at, lean=np.zeros_like(at.lean))
     return fuse(markers, tiles, sensors, start, lean_px=0.0, fixed_bias=held, fixed_poses=True, scale=at.scale)
 
 
@@ -319,10 +319,10 @@ class _Problem:
         # Squared weights as in rigcal.solve.adjust; tiles have one coordinate, corners two.
         A, _ = self.normal(at, e, J, CURVATURE * _weights(e, sigma) ** 2 * sigma**2)
         n_pose, n_cam = len(at.twist), len(at.bias)
-        P = self._with_held(A, inverse_over(A, free), free)
+        P, follows = self._with_held(A, inverse_over(A, free), free)
         if self.markers.doubt is not None:
-            follows = P[:, :n_pose] @ self.markers.H @ self.markers.doubt
-            P = P + follows @ follows.T
+            off = follows @ self.markers.doubt
+            P = P + off @ off.T
         known = np.array([self._information(A, free, n_pose + 2 * c, self.sensors[c]) for c in range(n_cam)])
         return replace(at, covariance=P[:-3, :-3], known=known.reshape(n_cam, 2), cost=self._cost(at, e, sigma))
 
@@ -336,18 +336,24 @@ class _Problem:
             total += 0.0 if self.lean_px <= 0 else float(((lean / (self.lean_px * sensor.lean_unit)) ** 2).sum())
         return float(total)
 
-    def _with_held(self, A: Array, P: Array, free: NDArray[np.bool_]) -> Array:
-        """A covariance P, with what poses and biases add that were held, but are no better known than beforehand."""
+    def _with_held(self, A: Array, P: Array, free: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """A covariance P, with what poses and biases add that were held, but are no better known than beforehand.
+
+        And how far everything is off (m, 6 (c + k)) when markers are.
+        """
         n_pose, n_bias = len(self.markers.H), 2 * len(self.sensors)
         movable = np.repeat(self.markers.free, 6)
         held = np.flatnonzero(~free[: n_pose + n_bias] & np.append(movable, np.ones(n_bias, dtype=bool)))
+        follows = P[:, :n_pose] @ self.markers.H
         if not len(held):
-            return P
+            return P, follows
         before = np.diag(np.append(np.zeros(n_pose), [np.diag(sensor.prior) for sensor in self.sensors]))
         before[:n_pose, :n_pose] = inverse_over(self.markers.H, movable)
         response = -P @ A[:, held]
         response[held] = np.eye(len(held))
-        return P + response @ before[np.ix_(held, held)] @ response.T
+        poses = held < n_pose
+        follows[:, held[poses]] = response[:, poses]
+        return P + response @ before[np.ix_(held, held)] @ response.T, follows
 
     def _information(self, A: Array, free: NDArray[np.bool_], first: int, sensor: DepthSensor) -> Array:
         """Eigenvalues (2,), ascending, of what everything but its prior knows of one camera's bias, in the prior's."""

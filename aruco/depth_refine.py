@@ -1,8 +1,8 @@
 """Letting depth correct what markers have found, as far as it proves right on what was not used.
 
-Owns      which biases can be told apart, how large leans are, when markers are doubted, the bounds, the words.
+Owns      which biases can be told apart, how large leans are, when markers are doubted, what is used, the bounds.
 Leaves    the estimate itself to depth_fusion, the test on held-out markers and depth to depth_trial, depth that cannot
-          be true to depth_faults, tiles to depth_tiles, the markers' equations to their maker.
+          be true to depth_faults, words to depth_findings, tiles to depth_tiles, the markers' equations to their maker.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from loguru import logger
 from numpy.typing import NDArray
 
 from aruco.depth_bias import DepthBias
-from aruco.depth_faults import worst_fault
+from aruco.depth_faults import indescribable, worst_fault
+from aruco.depth_findings import finding, why_believed
 from aruco.depth_fusion import (
     DepthSensor,
     Estimate,
@@ -53,7 +54,7 @@ class DepthRefinement:
     covariance: Mapping[str, Array] = field(default_factory=dict)  # camera -> (6, 6); empty unless poses are moved
     biases: Mapping[str, DepthBias] = field(default_factory=dict)  # of cameras that tell; empty unless accepted
     findings: Mapping[str, str] = field(default_factory=dict)  # camera -> what its depth tells, in words
-    left_out: Mapping[str, str] = field(default_factory=dict)  # camera whose depth cannot be true -> why, in words
+    left_out: Mapping[str, str] = field(default_factory=dict)  # camera whose depth is no biased depth -> why, in words
     moved: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # camera -> turn [rad], shift [m]
     patches: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # camera -> number on the target, on the floor
     scale: float = 1.0  # how many times larger residuals of depth are than its noise model promises
@@ -99,7 +100,12 @@ class DepthRefinement:
             "patches_on_floor": on_floor,
             "held_out_markers": None
             if growth is None
-            else {"n": growth.n_markers, "squares_grow": growth.squares, "by_chance": growth.chance},
+            else {
+                "n": growth.n_markers,
+                "rms_px": {"before": growth.px[0], "after": growth.px[1]},
+                "squares_grow": growth.squares,
+                "by_chance": growth.chance,
+            },
         }
 
 
@@ -169,12 +175,16 @@ def refine(
         fit = replace(fit, found=again)
     if fit.markers is not markers:
         halves = [replace(half, train=half.train.doubting()) for half in halves]
-    trial = on_held_out(halves, fit.tiles, sensors, floor, held, (fit.found.scale, fit.lean_px))
-    told |= {"held_out": trial.figures, "scale": fit.found.scale}
+    silent = indescribable(without_lean(fit.markers, fit.tiles, sensors, fit.found, held), markers, sensors)
+    unwritten = held | np.isin(np.arange(len(held)), list(silent))[:, None]
+    trial = on_held_out(halves, fit.tiles, sensors, floor, held, unwritten, (fit.found.scale, fit.lean_px))
+    unheard = {**fit.left_out, **{markers.cameras[c]: why for c, why in silent.items()}}
+    told |= {"held_out": trial.figures, "scale": fit.found.scale, "left_out": unheard}
     too_far = _beyond_bounds(markers, fit.found, max_rotation_deg, max_translation_m)
     if too_far:
         trial = replace(trial, against_move=too_far)
-    return replace(_judged(fit, trial, held, sensors, floor), **told)
+    result = _judged(fit, trial, unwritten, sensors, floor)
+    return replace(result, findings={**result.findings, **unheard}, **told)
 
 
 def _fitted(
@@ -232,17 +242,16 @@ def _judged(
     sensors: Mapping[str, DepthSensor],
     floor: tuple[Array, float] | None,
 ) -> DepthRefinement:
-    """What is used of a fit after its trial: all of it, biases beside the poses given, or nothing."""
+    """What is used of a fit after its trial: all of it, biases but those held beside the poses given, or nothing."""
     markers, names, moves = fit.markers, fit.markers.cameras, not trial.against_move
     at = fit.found if moves else replace(given_estimate(markers, floor), scale=fit.found.scale)
     alone = without_lean(markers, fit.tiles, sensors, at, held)
     biases = _biases(fit.found if moves else alone, alone, held, sensors, names)
-    findings = {n: _finding(biases.get(n), held[c], fit.tiles.only(fit.tiles.camera == c)) for c, n in enumerate(names)}
-    told: dict[str, Any] = {"findings": findings | dict(fit.left_out)}
+    findings = {n: finding(biases.get(n), held[c], fit.tiles.only(fit.tiles.camera == c)) for c, n in enumerate(names)}
     if not moves and (trial.against_bias or not biases):
         why = trial.against_bias or "there is too little depth to tell any bias"
-        return kept_as_it_was(markers, f"{trial.against_move}; {why}", **told)
-    kept = kept_as_it_was(markers, _why(trial, moves=moves), biases=biases, **told)
+        return kept_as_it_was(markers, f"{trial.against_move}; {why}", findings=findings)
+    kept = kept_as_it_was(markers, why_believed(trial, moves=moves), biases=biases, findings=findings)
     kept = replace(kept, bias_accepted=bool(biases))
     if not moves:
         return kept
@@ -282,25 +291,6 @@ def _biases(
     return biases
 
 
-def _why(trial: Trial, *, moves: bool) -> str:
-    """Why the result is believed, and what could not be asked."""
-    figures = trial.figures
-    if not moves:
-        mm = figures.depth_mm
-        tested = f"{mm[0]:.3g} mm before, {mm[1]:.3g} mm after" if figures.n_patches else "there was none to hold out"
-        return f"{trial.against_move}; poses stay, biases are taken out of depth (held-out depth: {tested})"
-    tested = [what for what, n in (("markers", figures.n_markers), ("depth", figures.n_patches)) if n]
-    untested = [name for name, growth in figures.growth.items() if not growth.n_markers]
-    if not tested:
-        return "there was nothing to hold out, so nothing was tested"
-    said = f"{' and '.join(tested)} that took no part are predicted at least as well"
-    if not figures.n_markers:
-        return f"{said}; no markers could be held out"
-    if untested:
-        said += f"; no markers of camera {', camera '.join(untested)} could be held out"
-    return said if figures.n_patches else f"{said}; no depth could be held out"
-
-
 def _more_than_chance(n: int) -> float:
     """What the sum of n squared normal numbers hardly ever exceeds: its mean and three standard deviations."""
     return n + 3.0 * math.sqrt(2.0 * n)
@@ -324,32 +314,3 @@ def _beyond_bounds(markers: MarkerEquations, found: Estimate, max_rotation_deg: 
         f"depth would move {', '.join(far)}, more than the {max_rotation_deg:g} degrees and "
         f"{1e3 * max_translation_m:g} mm that are allowed"
     )
-
-
-# --- words ----------------------------------------------------------------------------------------------------------
-
-
-def _finding(bias: DepthBias | None, held: NDArray[np.bool_], tiles: Tiles) -> str:
-    """What a camera's depth tells on its tiles, in words."""
-    if bias is None or not len(tiles):
-        return "too little depth on target and floor to tell its bias"
-    assert bias.covariance is not None, "it was estimated"
-    sigma = np.sqrt(np.diag(bias.covariance))
-    near, far = (1.0 / tiles.inverse.max(), 1.0 / tiles.inverse.min())
-    where = f"on {len(tiles)} patches from {near:.1f} to {far:.1f} m"
-    second = _second(bias, float(sigma[1]))
-    middle = np.array([float(np.median(1.0 / tiles.inverse))])
-    off_mm = 1e3 * float(middle[0] - bias.corrected(middle)[0])
-    side = f"{abs(off_mm):.0f} mm too {'far' if off_mm > 0 else 'near'} at {middle[0]:.1f} m"
-    if held[0]:
-        what = "offset" if bias.model == "offset" else "disparity"
-        return f"ranges {where} do not tell scale from {what}: scale is left at 0, {second}; {side}"
-    return f"scale {100 * bias.scale:+.2f} +- {100 * sigma[0]:.2f} %, {second}, {where}; {side}"
-
-
-def _second(bias: DepthBias, sigma: float) -> str:
-    if bias.model == "offset":
-        return f"offset {1e3 * bias.offset_m:+.1f} +- {1e3 * sigma:.1f} mm"
-    if bias.focal_baseline is None:
-        return f"inverse depth {bias.inverse_depth:+.5f} +- {sigma:.5f} 1/m"
-    return f"disparity {bias.disparity_px:+.3f} +- {sigma * bias.focal_baseline:.3f} px"

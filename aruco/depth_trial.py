@@ -68,8 +68,9 @@ class Growth:
     """
 
     n_markers: int
-    squares: float  # by how much their sum grows
-    chance: float  # standard deviation
+    px: tuple[float, float]  # root mean square before and after
+    squares: float  # by how much the sum of squares grows
+    chance: float  # standard deviation of that
 
     @property
     def is_worse(self) -> bool:
@@ -113,6 +114,7 @@ def on_held_out(
     sensors: Mapping[str, DepthSensor],
     floor: tuple[Array, float] | None,
     held: NDArray[np.bool_],
+    unwritten: NDArray[np.bool_],
     sizes: tuple[float, float],
 ) -> Trial:
     """Figures on what each half has not used, and what became worse.
@@ -122,15 +124,18 @@ def on_held_out(
         tiles: What depth says.
         sensors: Camera -> its depth.
         floor: Roughly.
-        held: (c, 2) parameters of biases that stay zero.
+        held: (c, 2) parameters of biases that stay zero in the estimate.
+        unwritten: (c, 2) those that stay zero in what is written.
         sizes: Scale of the residuals, size of the leans.
     """
     odd = _is_odd(tiles)
     compared = [
-        _compared(half, tiles, odd if k % 2 else ~odd, sensors, floor, held, sizes) for k, half in enumerate(halves)
+        _compared(half, tiles, odd if k % 2 else ~odd, sensors, floor, (held, unwritten), sizes)
+        for k, half in enumerate(halves)
     ]
     names = halves[0].train.cameras if halves else ()
-    growth = {name: _growth(compared, c) for c, name in enumerate(names)}
+    growth = {name: _growth(compared, [c]) for c, name in enumerate(names)}
+    together = _growth(compared, list(range(len(names))))
     loss, distance_m = (
         np.concatenate([np.empty((0, 3)), *(getattr(k, name) for k in compared)]) for name in ("loss", "distance_m")
     )
@@ -138,13 +143,13 @@ def on_held_out(
     recorded, alone, moved = loss.T
     mm = tuple(1e3 * _median(column) for column in distance_m.T)
     figures = HeldOut(
-        n_markers=sum(g.n_markers for g in growth.values()),
-        marker_px=(_rms([k.markers[0] for k in compared]), _rms([k.markers[1] for k in compared])),
+        n_markers=together.n_markers,
+        marker_px=together.px,
         n_patches=len(block),
         depth_mm=(mm[0], mm[1], mm[2]),
         growth=growth,
     )
-    against_bias, against_move = "", _of_markers(figures)
+    against_bias, against_move = "", _of_markers(growth, together)
     if _is_worse(recorded, alone, block):
         against_bias = f"held-out depth agrees no better without its bias: {mm[0]:.3g} mm before, {mm[1]:.3g} mm after"
     if not against_move and (_is_worse(alone, moved, block) or _is_worse(recorded, moved, block)):
@@ -160,20 +165,20 @@ def _compared(
     mine: NDArray[np.bool_],
     sensors: Mapping[str, DepthSensor],
     floor: tuple[Array, float] | None,
-    held: NDArray[np.bool_],
+    zero: tuple[NDArray[np.bool_], NDArray[np.bool_]],
     sizes: tuple[float, float],
 ) -> _Compared:
     """Held-out markers and tiles, before depth has its say, when it corrects itself alone, and when poses move."""
     known = tiles.target == FLOOR
     known[~known] = half.trained[tiles.target[~known]]
     train, test = tiles.only(mine & known), tiles.only(~mine & known)
-    start, nothing, (scale, lean_px) = start_estimate(half.train, floor), np.ones_like(held), sizes
-    start = replace(start, scale=scale)
+    (held, unwritten), (scale, lean_px) = zero, sizes
+    start = replace(start_estimate(half.train, floor), scale=scale)
     moved = fuse(half.train, train, sensors, start, lean_px=lean_px, fixed_bias=held, scale=scale)
     estimates = (
-        without_lean(half.train, train, sensors, start, nothing),
-        without_lean(half.train, train, sensors, start, held),
-        without_lean(half.train, train, sensors, moved, held),
+        without_lean(half.train, train, sensors, start, np.ones_like(held)),
+        without_lean(half.train, train, sensors, start, unwritten),
+        without_lean(half.train, train, sensors, moved, unwritten),
     )
     e = np.stack([np.nan_to_num(residuals(test, at, sensors, half.train), nan=np.inf) for at in estimates], axis=1)
     return _Compared(
@@ -187,33 +192,29 @@ def _compared(
     )
 
 
-def _growth(compared: Sequence[_Compared], camera: int) -> Growth:
-    """Of the squares of one camera's held-out corners; those that were far off anyway count little."""
+def _growth(compared: Sequence[_Compared], cameras: Sequence[int]) -> Growth:
+    """Of the squares of some cameras' held-out corners; those that were far off anyway count little."""
     n, squares, variance = 0, 0.0, 0.0
     for half in compared:
-        mine = half.markers[0].camera == camera
+        mine = np.isin(half.markers[0].camera, cameras)
         r, after = (k.off[mine] for k in half.markers)
         weight = 1.0 / (1.0 + (r**2).sum(axis=1) / KAPPA**2)
         n += len(np.unique(half.markers[0].marker[mine]))
         squares += float(weight @ ((after**2).sum(axis=1) - (r**2).sum(axis=1)))
         variance += 4.0 * float(weight @ ((after - r) ** 2).sum(axis=1))
-    return Growth(n_markers=n, squares=squares, chance=math.sqrt(variance))
+    px = tuple(_rms([half.markers[k] for half in compared], cameras) for k in (0, 1))
+    return Growth(n_markers=n, px=(px[0], px[1]), squares=squares, chance=math.sqrt(variance))
 
 
-def _of_markers(figures: HeldOut) -> str:
+def _of_markers(growth: Mapping[str, Growth], together: Growth) -> str:
     """Whose markers the move predicts worse, or all together, in words; empty if none."""
-    worse = [name for name, growth in figures.growth.items() if growth.is_worse]
-    every = figures.growth.values()
-    together = Growth(
-        n_markers=figures.n_markers,
-        squares=sum(g.squares for g in every),
-        chance=math.sqrt(sum(g.chance**2 for g in every)),
-    )
-    if not worse and not together.is_worse:
+    worse = {f"of camera {name}": of_camera for name, of_camera in growth.items() if of_camera.is_worse}
+    if together.is_worse and not worse:
+        worse = {"of all cameras": together}
+    if not worse:
         return ""
-    whose = f" of {', '.join(f'camera {name}' for name in worse)}" if worse else ""
-    px = figures.marker_px
-    return f"held-out markers{whose} are predicted worse with depth: {px[0]:.3g} px before, {px[1]:.3g} px after"
+    said = ", ".join(f"{whose} ({g.px[0]:.3g} px before, {g.px[1]:.3g} px after)" for whose, g in worse.items())
+    return f"held-out markers {said} are predicted worse with depth"
 
 
 def _is_odd(tiles: Tiles) -> NDArray[np.bool_]:
@@ -232,12 +233,10 @@ def _is_worse(before: Array, after: Array, group: Array) -> bool:
     return total > SIGNIFICANT * error and total > NOTICEABLE * float(before.sum())
 
 
-def _rms(parts: Sequence[HeldOutMarkers]) -> float:
-    """Over all markers, each of which counts by the mean square of its corners."""
-    sums = [np.bincount(part.marker, (part.off_px**2).sum(axis=1)) for part in parts]
-    counts = [np.bincount(part.marker) for part in parts]
-    squares = np.concatenate([np.empty(0), *(s[n > 0] / n[n > 0] for s, n in zip(sums, counts))])
-    return float(np.sqrt(squares.mean())) if len(squares) else 0.0
+def _rms(parts: Sequence[HeldOutMarkers], cameras: Sequence[int]) -> float:
+    """Distance of the corners of some cameras [px]."""
+    off = np.concatenate([np.empty((0, 2)), *(part.off_px[np.isin(part.camera, cameras)] for part in parts)])
+    return float(np.sqrt((off**2).sum(axis=1).mean())) if len(off) else 0.0
 
 
 def _median(values: Array) -> float:

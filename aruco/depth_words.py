@@ -15,6 +15,11 @@ AGREES_SIGMAS = 3.0
 GROSS_SHARE = 0.05
 # Residuals this many times the promised noise are no noise.
 ROUGH_SCATTER = 3.0
+# Pixels on faces this many times the promised noise off, root mean square, do not agree, whatever they are on average:
+# a mirrored image is right in its middle. Beyond this many times their average it is no bias that they are off by.
+MAX_RMSE_SIGMAS = 5.0
+MAX_RMSE_OF_LEVEL = 3.0
+_NOT_ITS_OWN = "check that the depth images are this camera's own and not mirrored, and the depth's intrinsics"
 _DISTORTED = "intrinsics or rectification that are off"
 _TURNED = "a pose that is turned, or intrinsics that are off"
 _CAUSES: dict[Cause, str] = {
@@ -60,12 +65,18 @@ def _shared(trend: Trend) -> str:
 
 
 def judgement(
-    level: tuple[float, float], range_m: tuple[float, float], trends: Trends | None, *, corrected: bool
+    level: tuple[float, float],
+    rmse: tuple[float, float, float],
+    range_m: tuple[float, float],
+    trends: Trends | None,
+    *,
+    corrected: bool,
 ) -> str:
     """What a user should think, and do, in one sentence.
 
     Args:
         level: Typical error [m], and its share of the range; positive: too far.
+        rmse: Root mean square error [m], in what noise and prints that are not flat explain, and that of most pixels.
         range_m: Nearest and farthest that was seen.
         trends: How the error goes with range and over the image.
         corrected: Whether a bias was taken out before.
@@ -82,13 +93,17 @@ def judgement(
     noise_m = 0.0 if trends is None else AGREES_SIGMAS * trends.level_sigma_m
     agrees = abs(share) <= AGREES_SHARE or abs(level_m) <= noise_m
     growth = _growth(trends)
+    stray = _stray(level_m, rmse, alike=agrees or corrected)
     if growth and agrees:
         parts = [f"depth is {amount} on average", *growth]
+    elif agrees and stray:
+        parts = [f"depth does not agree with the target, though it is {amount} on average"]
     elif agrees:
-        parts = [f"depth agrees with the target{'' if abs(share) <= AGREES_SHARE else ' within its noise'}, {amount}"]
+        said = f"agrees with the target{'' if abs(share) <= AGREES_SHARE else ' within its noise'}, {amount}"
+        parts = [f"most of depth {said}", _few(rmse)] if rmse[1] > MAX_RMSE_SIGMAS else [f"depth {said}"]
     else:
         parts = [f"depth is {amount}", *_cause(trends), *growth]
-    parts += _scatter(trends)
+    parts += [*_scatter(trends), *stray]
     if (growth or not agrees) and not corrected:
         parts.append(f"--refine-depth {'corrects poses' if _turned(trends) else 'estimates the bias'}")
     return "; ".join(parts) + "."
@@ -124,6 +139,18 @@ def _with_range(trend: Trend, level_m: float) -> str:
     if abs(level_m) < 0.1 * abs(trend.effect_m):
         return f"ever {'farther' if trend.slope > 0 else 'nearer'} with growing range"
     return f"{'more' if trend.slope * level_m > 0 else 'less'} so far away"
+
+
+def _few(rmse: tuple[float, float, float]) -> str:
+    return f"but some pixels are far off (RMSE {1e3 * rmse[0]:.0f} mm, {rmse[1]:.0f} sigmas), as beside edges"
+
+
+def _stray(level_m: float, rmse: tuple[float, float, float], *, alike: bool) -> list[str]:
+    """Errors that are far larger than noise, and neither what is typical; alike: those that are typical are small."""
+    rmse_m, sigmas, of_most = rmse
+    if not of_most > MAX_RMSE_SIGMAS or not (alike or rmse_m > MAX_RMSE_OF_LEVEL * abs(level_m)):
+        return []
+    return [f"pixels are {1e3 * rmse_m:.0f} mm off (RMSE), {sigmas:.0f} sigmas: {_NOT_ITS_OWN}"]
 
 
 def _scatter(trends: Trends | None) -> list[str]:

@@ -23,6 +23,11 @@ MAX_UP_ERROR_DEG = 5.0
 TARGET_BELOW_M = 0.1
 # A mirror needs three cameras: any two heights are mirrored about their mean.
 _MIRROR_CAMERAS = 3
+# A reflection in an upright plane keeps pitch and height and turns roll over: floors that are aslant to each other by
+# more than poses ever are, and level once rolls are turned over, tell it. Without any roll it cannot be told.
+_ASLANT_DEG = 1.0
+_MIRRORED_RATIO = 4.0
+_MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 def check_not_upside_down(
@@ -55,7 +60,20 @@ def check_not_mirrored(
         CalibrationError: They do.
     """
     names = [name for name in planes if planes[name]]
-    if len(names) < _MIRROR_CAMERAS or 2 * len(consensus.planes) > len(names):
+    if len(names) < _MIRROR_CAMERAS:
+        return
+    seen = {name: consensus.planes.get(name, planes[name][0]).normal for name in names}
+    aslant, mirrored = (
+        _scatter_deg(np.array([side * (T_world_cam[name][:3, :3] @ (side * n)) for name, n in seen.items()]))
+        for side in (np.ones(3), _MIRROR)
+    )
+    if aslant > max(_ASLANT_DEG, _MIRRORED_RATIO * mirrored):
+        raise CalibrationError(
+            f"The cameras' floors are {aslant:.1f} degrees aslant to each other, and {mirrored:.1f} once left and "
+            f"right are exchanged ({_cameras(names)}): the world is mirrored; check the order of corners in the marker "
+            "map, and whether the images were mirrored."
+        )
+    if 2 * len(consensus.planes) > len(names):
         return
     heights = np.array([float(T_world_cam[name][:3, 3] @ up) for name in names])
     clearances = np.array([planes[name][0].distance_m for name in names])
@@ -64,6 +82,13 @@ def check_not_mirrored(
             f"The higher a camera stands in this world the nearer it is to its floor ({_cameras(names)}): the world is "
             "mirrored; check the order of corners in the marker map and _meta.world.up."
         )
+
+
+def _scatter_deg(normals: Array) -> float:
+    """Root mean square of the angles of unit vectors (n, 3) from their mean."""
+    mean = normals.mean(axis=0)
+    across = np.linalg.norm(np.cross(normals, mean / np.linalg.norm(mean)), axis=1)
+    return math.degrees(float(np.sqrt(np.mean(across**2))))
 
 
 def check_floor(

@@ -17,6 +17,8 @@ from aruco.pose_math import Array, exp_so3, make_pose, rotation_angle
 
 MAX_ROTATION_DEG = 5.0
 MAX_TRANSLATION_M = 0.1
+# Of what a floor asks for; less is nothing that one would call levelling this camera.
+KEPT_GAIN = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,6 +39,11 @@ class FloorCorrection:
     tilt_after_deg: float = math.nan
     height_before_m: float = math.nan  # of its floor below the camera, above (+) the common one
     height_after_m: float = math.nan
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether hardly anything was done, because the pose is known better than what its camera sees of the floor."""
+        return self.accepted and self.gain < KEPT_GAIN
 
 
 def camera_motion(centre: Vec3, rotation_rad: Array, rise_m: float, up: Vec3) -> Mat44:

@@ -29,13 +29,14 @@ SCALE_LOG_SIGMA = math.log(6.0)
 SCALE_QUANTILES = (0.25, 0.97)
 # Share of a correction that would be done by the middle of what the scale may be, in the direction most in doubt: below
 # and above this the one or the other quantile is taken, and between the two in proportion.
-GAIN_RANGE = (0.25, 0.5)
+GAIN_RANGE = (0.2, 0.4)
 # One in a thousand (chi-square, 3 degrees) before a single camera's pose is called worse than the others'.
 ODD_CHI2 = 16.3
 # And its own error then is the one that makes it an ordinary surprise.
 MEAN_CHI2 = 3.0
-# The prior of bias is that of good cameras; of others it is twice as large.
-BIAS_LOG_SIGMA = math.log(1.5)
+# The prior of bias is that of usual cameras; where it may be much larger, rough poses on unbiased depth pass for good
+# ones on biased depth.
+BIAS_LOG_SIGMA = math.log(1.2)
 _SCALES = np.geomspace(0.02, 50.0, 60)
 _OWN_SCALES = np.geomspace(0.02, 1e4, 132)
 _BIAS_SCALES = np.geomspace(0.25, 8.0, 11)
@@ -51,7 +52,7 @@ class Scales:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Wants:
+class Wants:
     """The corrections that the cameras' floors ask for, linearly: ``wish = by_floor @ floor + correction + noise``."""
 
     wish: Array  # (n, 3)
@@ -60,8 +61,9 @@ class _Wants:
     bias: Array  # (n, 3, 3)
     prior: Array  # (n, 3, 3)
 
-    def only(self, keep: Mask) -> _Wants:
-        return _Wants(
+    def only(self, keep: Mask) -> Wants:
+        """Those of some of the cameras."""
+        return Wants(
             wish=self.wish[keep],
             by_floor=self.by_floor[keep],
             noise=self.noise[keep],
@@ -74,14 +76,15 @@ class _Wants:
         return self.noise + bias[..., None, None, None] ** 2 * self.bias + poses[..., None, None] ** 2 * self.prior
 
 
-def _wants(sights: Sequence[Sight], state: FloorState) -> _Wants:
+def wants_of(sights: Sequence[Sight], state: FloorState) -> Wants:
+    """What each camera's floor asks for, against the floor of a state."""
     wish, by_floor, back = [], [], []
     for sight in sights:
         predicted, floor_slope, camera_slope = predicted_plane(sight.T_world_cam, state, np.zeros(3))
         back.append(np.linalg.inv(camera_slope))
         wish.append(back[-1] @ (sight.a - predicted))
         by_floor.append(back[-1] @ floor_slope)
-    return _Wants(
+    return Wants(
         wish=np.array(wish),
         by_floor=np.array(by_floor),
         noise=np.array([B @ sight.noise @ B.T for B, sight in zip(back, sights)]),
@@ -90,7 +93,7 @@ def _wants(sights: Sequence[Sight], state: FloorState) -> _Wants:
     )
 
 
-def _floor_of(wants: _Wants, poses: Array, bias: Array) -> tuple[Array, Array, Array]:
+def _floor_of(wants: Wants, poses: Array, bias: Array) -> tuple[Array, Array, Array]:
     """The floor (..., 3), its covariance, and the restricted log-likelihood (...) of factors (..., n) and (...)."""
     S = wants.spread(poses, bias)
     W = np.linalg.inv(S)
@@ -105,7 +108,7 @@ def _floor_of(wants: _Wants, poses: Array, bias: Array) -> tuple[Array, Array, A
 
 def told_scales(sights: Sequence[Sight], state: FloorState) -> Scales:
     """The factors that the cameras' floors tell: of single cameras far off the others, then common ones of the rest."""
-    wants = _wants(sights, state)
+    wants = wants_of(sights, state)
     given = np.array([sight.given for sight in sights])
     # What an odd camera's own factor is has no part in the others': that would call these worse to explain it.
     own = np.full(len(sights), np.nan)
@@ -127,7 +130,7 @@ def told_scales(sights: Sequence[Sight], state: FloorState) -> Scales:
     )
 
 
-def _common_scales(wants: _Wants, given: Mask, quantiles: tuple[float, float] = SCALE_QUANTILES) -> tuple[Array, float]:
+def _common_scales(wants: Wants, given: Mask, quantiles: tuple[float, float] = SCALE_QUANTILES) -> tuple[Array, float]:
     """(n,) one factor for all poses without a covariance, one, at least 1, for those with one; and one for bias."""
     scales, bias = np.ones(len(given)), 1.0
     if len(given) < 2:
@@ -145,7 +148,7 @@ def _common_scales(wants: _Wants, given: Mask, quantiles: tuple[float, float] = 
     return scales, bias
 
 
-def _chosen(weights: Array, wants: _Wants, bias: float, quantiles: tuple[float, float]) -> float:
+def _chosen(weights: Array, wants: Wants, bias: float, quantiles: tuple[float, float]) -> float:
     """The scale to work with, of what the scales _SCALES are worth: between two quantiles, by who knows better."""
     below = np.cumsum(weights)
     lower, middle, upper = np.interp(np.array([quantiles[0], 0.5, quantiles[1]]) * below[-1], below, _SCALES)
@@ -157,7 +160,7 @@ def _chosen(weights: Array, wants: _Wants, bias: float, quantiles: tuple[float, 
     return float(lower ** (1.0 - share) * upper**share)
 
 
-def _surprise(k: int, wants: _Wants, given: Mask, ordinary: Mask) -> tuple[float, int, float]:
+def _surprise(k: int, wants: Wants, given: Mask, ordinary: Mask) -> tuple[float, int, float]:
     """Of one camera's wish under what other ordinary ones say: chi-square (3 degrees), its index, its own factor."""
     others = ordinary & (np.arange(len(given)) != k)
     rest = wants.only(others)

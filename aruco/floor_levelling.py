@@ -6,16 +6,19 @@ Leaves    finding the floor to floor_consensus, weighing to floor_fusion, contra
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from loguru import logger
 
+from aruco.errors import CalibrationError
 from aruco.floor_consensus import Consensus
 from aruco.floor_correction import FloorCorrection, bounded, camera_motion, target_height, turn_between
 from aruco.floor_fusion import Fusion, fuse, fused_covariances, uncorrected_covariance
 from aruco.floor_model import Sight, default_pose_covariance, level_prior
 from aruco.floor_plane import FloorPlane, Mat44
+from aruco.floor_steps import FloorStep, floor_step
 from aruco.pose_math import Array, Pose, exp_so3, invert_transform, make_pose
 from aruco.uncertainty import carried
 
@@ -72,6 +75,48 @@ def level_world(
             return _levelling(attempt, {**moves, **rejected}, covariances)
         worst = max(beyond, key=lambda name: _excess(beyond[name], bounds))
         rejected[worst] = beyond[worst]
+
+
+def of_one_height(
+    consensus: Consensus,
+    T_world_cam: Mapping[str, Pose],
+    covariances: Mapping[str, Array],
+    bounds: Bounds,
+    up: Array,
+) -> Consensus:
+    """The floor without the few cameras that see another one beside it; see level_world.
+
+    Raises:
+        CalibrationError: Neither of two floors is seen by most cameras.
+    """
+    while len(consensus.planes) > 1:
+        attempt = _settled(sorted(consensus.planes), consensus, T_world_cam, covariances, bounds, up)
+        step = floor_step(attempt.sights, attempt.fusion.state)
+        if step is None:
+            break
+        rest = {name: plane for name, plane in consensus.planes.items() if name not in step.cameras}
+        if len(rest) <= len(step.cameras):
+            raise CalibrationError(_two_floors(step, consensus, T_world_cam, up))
+        logger.debug("cameras {} see a floor {:+.3f} m off the others'", step.cameras, step.rise_m)
+        name = max(rest, key=lambda name: rest[name].share)
+        consensus = replace(consensus, floor=rest[name].in_world(T_world_cam[name]), planes=rest)
+    return consensus
+
+
+def _two_floors(step: FloorStep, consensus: Consensus, T_world_cam: Mapping[str, Pose], up: Array) -> str:
+    def told(names: Sequence[str]) -> str:
+        heights = [
+            float(T_world_cam[n][:3, 3] @ up) - consensus.planes[n].distance_m / float(consensus.floor.normal @ up)
+            for n in names
+        ]
+        return f"camera{'s' if len(names) > 1 else ''} {', '.join(names)} at {np.mean(heights):.2f} m"
+
+    others = sorted(consensus.planes.keys() - set(step.cameras))
+    return (
+        f"The cameras see floors of two heights that are {abs(step.rise_m):.2f} m apart, more than poses and bias of "
+        f"depth explain: {told(step.cameras)}, {told(others)}, and neither is most of them; say with --height-range "
+        "which one is the floor."
+    )
 
 
 def _excess(move: FloorCorrection, bounds: Bounds) -> float:

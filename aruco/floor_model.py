@@ -16,7 +16,7 @@ from aruco.pose_math import Array, Pose, exp_so3, skew
 
 # Pose errors where nobody has said them, one sigma; their size is then scaled by the evidence. A target seen from
 # 2 or 3 m turns camera and place together, so a turn comes with a shift of 2.5 m times as much.
-DEFAULT_TURN_RAD = math.radians(0.2)
+DEFAULT_TURN_RAD = math.radians(0.4)
 DEFAULT_LEVER_M = 2.5
 # No covariance is believed beyond this: tripods creep, lenses breathe, and it keeps the equations solvable.
 LEAST_TURN_RAD = math.radians(0.005)

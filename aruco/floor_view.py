@@ -5,7 +5,8 @@ Leaves    planes in arbitrary points to floor_plane, which of them is the floor 
 
 A plane ``n . X + d = 0`` of the camera's frame is linear in inverse depth along rays r = X / z: ``1 / z = a . r``
 with ``a = -n / d``. There the disparity noise of a stereo camera is the same everywhere and has no bias, and its
-systematic error ``1 / z_true = (1 + s) / z - e`` only scales and shifts a.
+systematic error ``1 / z_true = (1 + s) / z - e`` only scales and shifts a. What rectification leaves grows across the
+image: this lean ``l . (x, y)`` in inverse depth adds to a what a turn of the camera would (see depth_fusion).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from aruco.depth_bias import DepthBias
 from aruco.depth_image import check_depth
 from aruco.depth_mask import mask_edges, mask_grazing
-from aruco.depth_noise import DepthNoise, bias_prior, independent_count
+from aruco.depth_noise import DEFAULT_FOCAL_BASELINE, DepthNoise, bias_prior, independent_count
 from aruco.errors import InputError
 from aruco.floor_plane import (
     MAX_TILT_DEG,
@@ -36,6 +37,9 @@ from aruco.pose_math import Array, Pose
 
 # ZED's confidence: the SDK's own default keeps what is at most 95; beyond it is noise.
 MAX_CONFIDENCE = 95
+# Growth of the disparity's error across the image [px a unit of the ray], one sigma: rectification holds to 0.15 mrad
+# (see the bias prior), which is 0.1 px at f = 700 px. Estimated biases do not have it either.
+LEAN_PX = 0.1
 # Depth noise that no longer tells a floor from a carpet's edge.
 MAX_SIGMA_M = 0.1
 # Real floors and lenses bend; half a slab is never thinner than this.
@@ -65,6 +69,7 @@ class FloorSamples:
     sigma: Array  # (n,) its standard deviation
     bias_slope: Array  # (2, n) its derivative by the bias's two parameters
     bias_covariance: Array  # (2, 2) what is not known of these
+    lean_sigma: float  # of what is not known of the growth of the inverse depth's error along x and y of the ray [1/m]
     stride: int
 
     @property
@@ -121,6 +126,7 @@ def floor_samples(camera: str, data: Mapping[str, Any], stride: int) -> FloorSam
         )
     depth = check_depth(data["depth"], where)
     K = _checked_intrinsics(data["K"], depth.shape, where)
+    _check_stride(stride, depth.shape, where)
     baseline = data.get("baseline")
     bias = data.get("bias") or DepthBias()
     focal_baseline = float(K[0, 0]) * float(baseline) if baseline else bias.focal_baseline
@@ -140,6 +146,7 @@ def floor_samples(camera: str, data: Mapping[str, Any], stride: int) -> FloorSam
         sigma=sigma_z / true**2,
         bias_slope=-bias.derivative(z) / true**2,
         bias_covariance=bias_prior(focal_baseline, bias.model) if bias.covariance is None else bias.covariance,
+        lean_sigma=LEAN_PX / (focal_baseline or DEFAULT_FOCAL_BASELINE),
         stride=stride,
     )
 
@@ -155,6 +162,16 @@ def _checked_intrinsics(K: Any, shape: tuple[int, ...], where: str) -> Array:
             f"{width} x {height}; give the K of the depth image's own size."
         )
     return matrix
+
+
+def _check_stride(stride: int, shape: tuple[int, ...], where: str) -> None:
+    height, width = shape
+    left = math.ceil(height / stride) * math.ceil(width / stride)
+    if left < MIN_INLIERS <= height * width:
+        raise InputError(
+            f"{where}: a stride of {stride} leaves {left} pixels of its depth of {width} x {height}, too few for a "
+            "floor; give a smaller --stride."
+        )
 
 
 def _untrusted(confidence: Any, shape: tuple[int, ...], where: str) -> Mask:
@@ -285,4 +302,5 @@ def _covariances(samples: FloorSamples, a: Array, index: NDArray[np.intp]) -> tu
     seen = inverse_information @ (sums.T @ sums) @ inverse_information
     grown = max(1.0, float(np.trace(np.linalg.solve(modelled, seen))) / 3.0)
     slope = inverse_information @ (rays.T @ (W * samples.bias_slope[:, index]).T)
-    return grown * modelled, slope @ samples.bias_covariance @ slope.T
+    lean = np.diag([samples.lean_sigma**2, samples.lean_sigma**2, 0.0])
+    return grown * modelled, slope @ samples.bias_covariance @ slope.T + lean

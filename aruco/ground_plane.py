@@ -26,7 +26,7 @@ from aruco.floor_correction import (
     target_height,
 )
 from aruco.floor_doubts import FloorDoubts, floor_doubts
-from aruco.floor_levelling import Bounds, Levelling, level_world
+from aruco.floor_levelling import Bounds, Levelling, level_world, of_one_height
 from aruco.floor_plane import (
     UP,
     FloorPlane,
@@ -53,6 +53,10 @@ __all__ = [
     "unproject_depth_to_points",
 ]
 
+# Whatever is larger is a slip of the hand or another unit: no pose is that far off, no floor that far away or thick.
+MOST = {"max_rotation_deg": 90.0, "max_translation_m": 10.0, "ransac_threshold_m": 1.0}
+MOST_FLOOR_Y_M = 1000.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundPlaneConfig:
@@ -69,14 +73,14 @@ class GroundPlaneConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers that no floor can be searched with."""
-        for name in ("max_rotation_deg", "max_translation_m", "ransac_threshold_m"):
+        for name, most in MOST.items():
             value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InputError(f"{name} must be a positive number, got {value}.")
-        if self.stride < 1 or self.seed < 0 or not math.isfinite(self.target_floor_y):
+            if value is not None and not 0 < value <= most:
+                raise InputError(f"{name} must be above 0 and at most {most:g}, got {value}.")
+        if self.stride < 1 or self.seed < 0 or not abs(self.target_floor_y) <= MOST_FLOOR_Y_M:
             raise InputError(
-                f"want a stride from 1, a seed from 0 and a finite target_floor_y, got {self.stride}, {self.seed} and "
-                f"{self.target_floor_y}."
+                f"want a stride from 1, a seed from 0 and a target_floor_y within {MOST_FLOOR_Y_M:g} m of 0, got "
+                f"{self.stride}, {self.seed} and {self.target_floor_y}."
             )
         if self.height_range is not None and not self.height_range[0] < self.height_range[1]:
             raise InputError(f"height_range wants the lower height first, got {self.height_range}.")
@@ -155,13 +159,15 @@ def refine_ground_from_depth(
         )
     check_not_mirrored({name: view.planes for name, view in views.items()}, consensus, poses, up)
     check_floor(consensus.floor, poses, up, target_points)
+    consensus = of_one_height(consensus, poses, covariances or {}, config.bounds, up)
     levelling = level_world(consensus, poses, covariances or {}, config.bounds, up)
     check_floor(levelling.floor, poses, up, target_points)
+    consensus = replace(consensus, floor=levelling.floor)
     logger.debug("floor: {} cameras, pose scales {}", len(consensus.planes), levelling.scales)
     corrections = {name: _with_residuals(name, levelling, views[name], consensus, config) for name in levelling.moves}
     return levelling.T_world_cam, GroundPlaneMetrics(
         success=True,
-        message=_message(levelling, len(poses)),
+        message=_message(levelling, len(poses), up),
         camera_planes={name: p.in_world(levelling.T_world_cam[name]) for name, p in consensus.planes.items()},
         floor_before=levelling.floor,
         T_level_world=levelling.T_level_world,
@@ -257,14 +263,15 @@ def _with_residuals(
     )
 
 
-def _message(levelling: Levelling, n_cameras: int) -> str:
+def _message(levelling: Levelling, n_cameras: int, up: Array) -> str:
     common = levelling.T_level_world
     accepted = [move for move in levelling.moves.values() if move.accepted]
     rejected = len(levelling.moves) - len(accepted)
+    raised_m = float(common[:3, 3] @ up)
     parts = [
         f"{len(levelling.moves)} of {n_cameras} cameras see the floor",
-        f"the world was turned by {math.degrees(rotation_angle(common[:3, :3])):.2f} degrees and raised by "
-        f"{1e3 * float(np.linalg.norm(common[:3, 3])):.0f} mm",
+        f"the world was turned by {math.degrees(rotation_angle(common[:3, :3])):.2f} degrees and "
+        f"{'raised' if raised_m >= 0 else 'lowered'} by {1e3 * abs(raised_m):.0f} mm",
     ]
     if accepted:
         turn, rise = max(m.rotation_deg for m in accepted), max(abs(m.translation_m) for m in accepted)

@@ -47,8 +47,8 @@ def hear_depth(
     Args:
         average: Where the adjustment started.
         rig: The solved rig.
-        joint: Its adjustment, maybe with cameras that the rig refuses; None where the average was kept, which nothing is
-            corrected of.
+        joint: Its adjustment, maybe with cameras that the rig refuses; None where the average was kept, which is not
+            corrected.
         evidence: With pooled depth.
         kept: Cameras that stay, with the biases that their file knows.
     """

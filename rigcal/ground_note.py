@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,13 @@ from rigcal.levelled_file import RigFile
 
 # What a file says of poses and views under its _meta, and levelling does not measure again.
 OF_GIVEN_POSES = ("adjusted", "depth_refined", "depth_verified", "kept", "quality")
+
+# What levelling promises of rough poses; floors that agree so well are not worth a word.
+AGREES_DEG, AGREES_MM = 0.1, 4.0
+BIAS_OF_FLOOR = (
+    "The biases of depth were estimated with the floor's help; where that was in this depth, biases and floor share "
+    "its errors, and the covariances count it twice."
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +71,7 @@ def ground_note(
             name: _correction(c, metrics.camera_planes.get(name)) for name, c in sorted(metrics.corrections.items())
         },
         "without_correction": dict(partial),
+        "remarks": [BIAS_OF_FLOOR] if given.is_depth_refined else [],
         "still_of_the_given_poses": [key for key in OF_GIVEN_POSES if key in given.meta],
         "up_is_assumed": given.up_is_assumed,
         "depth_bias_applied": sorted(given.depth_bias.keys() & metrics.camera_planes.keys()),
@@ -76,10 +84,28 @@ def ground_note(
     }
 
 
-def facts_of(metrics: GroundPlaneMetrics, config: GroundPlaneConfig) -> tuple[str, ...]:
-    """Sentences about the whole rig."""
+def facts_of(
+    metrics: GroundPlaneMetrics, config: GroundPlaneConfig, known_bias: Collection[str] = ()
+) -> tuple[str, ...]:
+    """Sentences about the whole rig; known_bias are cameras whose depth has no unknown bias."""
     way = "up, against gravity" if config.up[1] > 0 else "down, along gravity"
-    return metrics.message, f"World: the floor is y = {config.target_floor_y:g}; y points {way}."
+    world = f"World: the floor is y = {config.target_floor_y:g}; y points {way}."
+    kept = {name: c for name, c in metrics.corrections.items() if c.is_kept}
+    return metrics.message, world, *([_why_kept(kept, known_bias)] if kept else [])
+
+
+def _why_kept(kept: Mapping[str, FloorCorrection], known_bias: Collection[str]) -> str:
+    tilt_deg = max(c.tilt_before_deg for c in kept.values())
+    height_mm = max(1e3 * abs(c.height_before_m) for c in kept.values())
+    one, many = ("pose of camera", "is", "its floor"), ("poses of cameras", "are", "their floors")
+    pose, verb, floor = many if len(kept) > 1 else one
+    said = (
+        f"Kept: the {pose} {', '.join(kept)} {verb} known better than {floor}, up to {tilt_deg:.2f} degrees and "
+        f"{height_mm:.0f} mm off the common one"
+    )
+    if kept.keys() <= set(known_bias) or (tilt_deg <= AGREES_DEG and height_mm <= AGREES_MM):
+        return f"{said}."
+    return f"{said}; bias of depth can do that, and calibrate-extrinsics --refine-depth estimates it."
 
 
 def _correction(correction: FloorCorrection, plane: FloorPlane | None) -> dict[str, Any]:

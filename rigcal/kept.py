@@ -67,7 +67,11 @@ def kept_from_file(path: Path) -> KeptRig:
     Raises:
         InputError: It cannot be read, or an entry has no rigid pose, or what it says of cameras or world is not that.
     """
-    content = native.read_json(path)
+    return kept_of(native.read_json(path), path)
+
+
+def kept_of(content: Mapping[str, Any], path: Path) -> KeptRig:
+    """The same, of the content of a file that was read."""
     poses = native.poses_of(content, path)
     meta = content.get("_meta")
     meta = meta if isinstance(meta, dict) else {}
@@ -111,7 +115,7 @@ def _covariance(numbers: Any, where: str) -> Array:
     try:
         covariance = np.array(numbers, dtype=np.float64).reshape(6, 6)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{where} is not 36 numbers; mend or remove it.") from error
+        raise InputError(f"{where} is not 36 numbers in a list, row by row; mend or remove it.") from error
     largest = float(np.abs(covariance).max())
     if not (np.abs(covariance - covariance.T) <= SYMMETRIC * largest).all() or (np.diag(covariance) < 0).any():
         raise InputError(f"{where} is not symmetric with variances on its diagonal; mend or remove it.")

@@ -6,11 +6,12 @@ Leaves    reading and checking poses to kept and formats.native; levelling itsel
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from aruco.depth_bias import DepthBias, bias_from_dict
 from aruco.errors import InputError
@@ -18,8 +19,10 @@ from aruco.model import UpAxis
 from aruco.pose_math import Array, Pose, pose_text
 from rigcal.formats import native
 from rigcal.ground_doubts import GroundDoubts, judged
-from rigcal.kept import kept_from_file
+from rigcal.kept import kept_of
 
+# No rig is that far from its target; in millimetres it is.
+FAR_M = 200.0
 # Figures of a camera that judge the pose which markers gave it, not the one that the floor has corrected.
 _OF_MARKERS = ("rms_px", "spread_mm", "spread_deg")
 
@@ -50,10 +53,26 @@ class RigFile:
         return world.get("origin") if isinstance(world, dict) else None
 
     @property
+    def floor_y(self) -> float:
+        """Where a file whose origin is the floor has it: where it was wished when it was levelled."""
+        wished = self._levelled("provenance", "options", "target_floor_y")
+        return float(wished) if isinstance(wished, (int, float)) else 0.0
+
+    @property
+    def is_depth_refined(self) -> bool:
+        """Whether the biases of depth were estimated with a floor, perhaps this one."""
+        refined = self.meta.get("depth_refined")
+        return bool(self.depth_bias) and isinstance(refined, dict) and refined.get("accepted") is True
+
+    @property
     def levelled_with(self) -> str | None:
         """SHA-256 of the depth that the rig was levelled with before."""
+        return self._levelled("provenance", "inputs_sha256", "depth")
+
+    def _levelled(self, *keys: str) -> Any:
+        """What an earlier levelling says of itself."""
         found: Any = self.meta
-        for key in ("ground_refined", "provenance", "inputs_sha256", "depth"):
+        for key in ("ground_refined", *keys):
             found = found.get(key) if isinstance(found, dict) else None
         return found
 
@@ -71,7 +90,8 @@ def rig_file(path: Path) -> RigFile:
     Raises:
         InputError: The file cannot be read, holds a pose, covariance or bias that is none, or its world is not upright.
     """
-    kept, content = kept_from_file(path), native.read_json(path)
+    content, digest = native.read_json_and_digest(path)
+    kept = kept_of(content, path)
     meta = content.get("_meta")
     world = meta.get("world") if isinstance(meta, dict) else None
     says_up = isinstance(world, dict) and "up" in world
@@ -80,9 +100,16 @@ def rig_file(path: Path) -> RigFile:
             f"{path}: its world does not stand upright (_meta.world.up is null), so no plane can be told to be the "
             "floor; run calibrate-extrinsics again with --auto-align."
         )
+    far = {name: float(np.linalg.norm(T[:3, 3])) for name, T in kept.T_world_cam.items()}
+    name = max(far, key=lambda name: far[name])
+    if far[name] > FAR_M:
+        raise InputError(
+            f"{path}: camera {name} stands {far[name]:.0f} m from the world's origin, which looks like millimetres; "
+            "poses want metres: divide their last column by 1000, or move the world's origin to the rig."
+        )
     return RigFile(
         name=path.name,
-        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
+        digest=digest,
         content=content,
         T_world_cam=kept.T_world_cam,
         covariance=kept.covariance,

@@ -89,7 +89,7 @@ class Levelling:
     def facts(self) -> tuple[str, ...]:
         """Sentences about the whole rig."""
         doubt = self.doubts.rig
-        return *facts_of(self.metrics, self.config), *([doubt] if doubt else [])
+        return *facts_of(self.metrics, self.config, self.given.depth_bias.keys()), *([doubt] if doubt else [])
 
     @property
     def figures(self) -> tuple[FloorFigures, ...]:

@@ -105,8 +105,19 @@ def _on_floor(
 
 
 def _warn_of_result(levelling: Levelling) -> None:
-    """Doubt a floor that lies above the target."""
+    """Doubt a floor that lies above the target, or elsewhere than the file has it."""
     given, config = levelling.given, levelling.config
+    floor = levelling.metrics.floor_before
+    if given.origin == "floor" and floor is not None:
+        off_m = floor.height - levelling.up_y * given.floor_y
+        if abs(off_m) > ORIGIN_BELOW_FLOOR_M:
+            logger.warning(
+                "this floor lies {:.2f} m {} the floor that {} was levelled on; if it is a table, say so with "
+                "--height-range",
+                abs(off_m),
+                "above" if off_m > 0 else "below",
+                given.name,
+            )
     sunk_m = levelling.up_y * (config.target_floor_y - float(levelling.metrics.T_level_world[1, 3]))
     if given.origin == "target" and sunk_m > ORIGIN_BELOW_FLOOR_M:
         logger.warning(

@@ -15,7 +15,7 @@ from typing import Any
 from aruco.atomic import check_writable, write_whole
 from aruco.errors import OutputError
 from rigcal.cli import beside
-from rigcal.formats.native import write_json
+from rigcal.formats import native
 from rigcal.levelled_rig import Levelling
 from rigcal.report.floor_page import floor_page
 
@@ -57,17 +57,37 @@ class LevellingOutputs:
         return [path for path in (self.metrics, self.page, self.poses) if path is not None]
 
     def write(self, levelling: Levelling) -> None:
-        """Write every file whole or not at all.
+        """Write every file whole, or none of them.
 
         Raises:
             OutputError: One cannot be written.
         """
-        page = "" if self.page is None else _page(levelling)  # whatever can fail comes before the first file
+        contents: dict[Path, bytes] = {}
         if self.metrics is not None:
-            write_json(self.metrics, {"format": "rigcal.ground_refined", "version": 1, **levelling.note})
+            note = {"format": "rigcal.ground_refined", "version": 1, **levelling.note}
+            contents[self.metrics] = native.json_bytes(note)
         if self.page is not None:
-            write_whole(self.page, page.encode())
-        write_json(self.poses, levelling.content)
+            contents[self.page] = _page(levelling).encode()
+        contents[self.poses] = native.json_bytes(levelling.content)
+        _write_all(contents)
+
+
+def _write_all(contents: Mapping[Path, bytes]) -> None:
+    """Beside their goals first, so that a full disk leaves nothing behind; then in their order."""
+    goals = {path: path.resolve() for path in contents}
+    staged = {path: goal.with_name(f"{goal.name}.new") for path, goal in goals.items()}
+    try:
+        for path, data in contents.items():
+            write_whole(staged[path], data)
+        for path, goal in goals.items():
+            staged[path].replace(goal)
+    except OSError as error:
+        raise OutputError(
+            f"The outputs cannot be written ({error.strerror or error}); choose another place."
+        ) from error
+    finally:
+        for part in staged.values():
+            part.unlink(missing_ok=True)
 
 
 def _page(levelling: Levelling) -> str:

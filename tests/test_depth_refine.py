@@ -2,34 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from depth_rooms import FLOOR_PLANE, FOCAL_BASELINE, Room, box_room
 from joint_rigs import box_rig, rich_box
+from numpy.typing import NDArray
 
 from aruco.camera_depth import CameraDepth
 from aruco.depth_bias import DepthBias
-from aruco.depth_fusion import DepthSensor, Estimate, _moved, _Problem, fuse, start_estimate
+from aruco.depth_faults import indescribable
+from aruco.depth_fusion import (
+    KAPPA,
+    DepthSensor,
+    Estimate,
+    _moved,
+    _Problem,
+    fuse,
+    given_estimate,
+    residuals,
+    start_estimate,
+    without_lean,
+)
 from aruco.depth_noise import DepthNoise, bias_prior
 from aruco.depth_refine import inseparable, lean_size, refine
-from aruco.depth_tiles import surface_tiles
-from aruco.depth_trial import HeldOutMarkers
+from aruco.depth_tiles import Tiles, surface_tiles
+from aruco.depth_trial import HeldOutMarkers, MarkerHalf, on_held_out
 from aruco.model import SILENT
 from aruco.pose_math import Array, exp_se3, invert_transform, log_se3
+from aruco.rig_estimate import RigEstimate
 from aruco.shared_floor import DepthView, find_shared_floor, floor_pixels
-from rigcal.config import CalibrateConfig, DetectConfig
+from rigcal.config import CalibrateConfig, DepthConfig, DetectConfig
 from rigcal.depth_pooling import pool_recording
 from rigcal.depth_refining import refine_with_depth
 from rigcal.depth_samples import face_depths
-from rigcal.evidence import look
+from rigcal.depth_witness import hear_depth
+from rigcal.evidence import Evidence, look
 from rigcal.kept import NOTHING_KEPT
 from rigcal.marker_equations import camera_covariance, marker_equations
 from rigcal.placing import adjust_placed, place_cameras
 from rigcal.quality.truth import pair_errors
-from rigcal.sim import simulate
-from rigcal.solve.joint import adjust_rig
+from rigcal.sim import Simulation, simulate
+from rigcal.solve.joint import JointRig, adjust_rig
 from rigcal.target import marker_target
 from rigcal.validation_case import case_of
 
@@ -130,6 +146,14 @@ def test_one_range_does_not_tell_scale_from_disparity() -> None:
         truth = DepthBias(scale=room.bias[c, 0], inverse_depth=room.bias[c, 1]).corrected(here)
         # Some ten tiles of 0.06 px, 3 mm each at 2 m, and 0.5 mm of the marker pose: 1.1 mm, of which three.
         np.testing.assert_allclose(bias.corrected(here), truth, atol=3.5e-3)
+    # What markers doubt is no news of it.
+    along = np.zeros((len(room.markers.H), 1))
+    along[3:6, 0] = 0.003 * room.truth[0, :3, 2]
+    doubted = replace(room.markers, doubt=along)
+    held = np.tile([True, False], (4, 1))
+    at = fuse(doubted, room.tiles, room.sensors, start_estimate(doubted, None), lean_px=0.0, fixed_bias=held)
+    assert at.covariance is not None
+    assert at.covariance[len(at.twist), len(at.twist)] == pytest.approx(0.003**2, rel=1e-6)
     # With the floor both are told.
     whole = refined(box_room(np.random.default_rng(5)))
     assert all("do not tell" not in said for said in whole.findings.values())
@@ -186,6 +210,96 @@ def test_depth_corrects_what_markers_doubt_only_if_it_shows() -> None:
     assert np.sqrt(np.trace(found["right"].covariance["c0"][3:, 3:])) > 5e-3
 
 
+def test_sigmas_are_honest_beside_poses_that_stay() -> None:
+    squares, naive = [], []
+    for seed in range(20):
+        room = box_room(np.random.default_rng(200 + seed), n_cameras=2)
+        start = given_estimate(room.markers, FLOOR_PLANE)
+        found = without_lean(room.markers, room.tiles, room.sensors, start, np.zeros((2, 2), dtype=bool))
+        sure = replace(room.markers, H=1e6 * room.markers.H)
+        blind = without_lean(sure, room.tiles, room.sensors, start, np.zeros((2, 2), dtype=bool))
+        for at, into in ((found, squares), (blind, naive)):
+            assert at.covariance is not None
+            e = (at.bias - room.bias).ravel()
+            into.append(e @ np.linalg.solve(at.covariance[18:22, 18:22], e))
+    # The mean of 20 chi-squares of 4 degrees: 4 +- 0.63, of which three.
+    assert np.mean(squares) == pytest.approx(4, abs=1.9)
+    # What is not known of the poses is most of it.
+    assert np.mean(naive) > 8
+
+
+def test_what_is_written_is_best_without_the_leans_that_nobody_writes() -> None:
+    room = box_room(np.random.default_rng(19), lean_px=0.5)
+    start = start_estimate(room.markers, FLOOR_PLANE)
+    size = lean_size(room.markers, room.tiles, room.sensors, start)
+    full = fuse(room.markers, room.tiles, room.sensors, start, lean_px=size)
+    full = fuse(room.markers, room.tiles, room.sensors, start, lean_px=size, fixed_bias=inseparable(full))
+    found = refined(room)
+    assert found.poses_accepted, found.reason
+    written = np.array([[b.scale, b.inverse_depth] for b in found.biases.values()])
+    off: list[float] = []
+    for bias in (full.bias, written):
+        bare = replace(full, lean=np.zeros_like(full.lean), bias=bias)
+        e = residuals(room.tiles, bare, room.sensors, room.markers)
+        off.append(float(np.log1p((e / KAPPA) ** 2).sum()))
+    assert off[1] < 0.98 * off[0]
+    # And they are known to be farther from the truth than an estimate with leans is.
+    assert full.covariance is not None
+    n = len(full.twist)
+    for c, bias in enumerate(found.biases.values()):
+        assert bias.covariance is not None
+        assert (np.diag(bias.covariance) >= np.diag(full.covariance)[n + 2 * c : n + 2 * c + 2]).all()
+
+
+# --- faults ---------------------------------------------------------------------------------------------------------
+
+
+def mirrored(tiles: Tiles, mine: NDArray[np.bool_]) -> Tiles:
+    return replace(tiles, ray=np.where(mine[:, None], tiles.ray * [-1.0, 1.0, 1.0], tiles.ray))
+
+
+def three_percent_too_far(tiles: Tiles, mine: NDArray[np.bool_]) -> Tiles:
+    return replace(tiles, inverse=np.where(mine, tiles.inverse / 1.03, tiles.inverse))
+
+
+@pytest.mark.parametrize("fault", [mirrored, three_percent_too_far])
+def test_depth_that_cannot_be_true_is_told_and_does_not_spoil_the_others(
+    fault: Callable[[Tiles, NDArray[np.bool_]], Tiles],
+) -> None:
+    room = box_room(np.random.default_rng(27))
+    room = replace(room, tiles=fault(room.tiles, room.tiles.camera == 1))
+    found = refined(room)
+    assert found.left_out.keys() == {"c1"}
+    assert "mirrored" in found.findings["c1"]
+    assert found.as_dict()["cameras"]["c1"]["left_out"]
+    assert found.bias_accepted, found.reason
+    assert found.biases.keys() == {"c0", "c2", "c3"}
+    for name, bias in found.biases.items():
+        truth = room.bias[int(name[1])]
+        assert abs(bias.scale - truth[0]) < SCALE_TOLERANCE
+        assert bias.disparity_px is not None
+        assert abs(bias.disparity_px - FOCAL_BASELINE * truth[1]) < DISPARITY_TOLERANCE_PX
+    # No rig of the usual biases has such a camera.
+    assert all(not refined(box_room(np.random.default_rng(k))).left_out for k in (21, 22))
+
+
+def test_nobody_is_left_where_all_depth_is_of_another_unit() -> None:
+    room = box_room(np.random.default_rng(23))
+    found = refined(replace(room, tiles=replace(room.tiles, inverse=room.tiles.inverse / 1.2)))
+    assert not found.accepted
+    assert found.left_out.keys() == set(room.markers.cameras)
+    assert found.reason == "no camera's depth can be true"
+
+
+def test_two_numbers_do_not_stand_for_a_lean() -> None:
+    room = box_room(np.random.default_rng(24))
+    at = given_estimate(room.markers, FLOOR_PLANE)
+    at = replace(at, bias=np.array([[0.006, 0.3 / FOCAL_BASELINE], [-0.02, -0.7 / FOCAL_BASELINE], [0, 0], [0, 0]]))
+    told = indescribable(at, room.markers, room.sensors)
+    assert told.keys() == {1}
+    assert "leans across the image" in told[1]
+
+
 # --- what is refused ------------------------------------------------------------------------------------------------
 
 
@@ -215,7 +329,8 @@ def test_poses_that_predict_other_markers_worse_are_not_taken() -> None:
     halves = [replace(half, held_out=only_c2_knows) for half in room.halves()]
     found = refine(room.markers, halves, room.tiles, room.sensors, FLOOR_PLANE)
     assert not found.poses_accepted
-    assert "held-out markers of camera c2 are predicted worse" in found.reason
+    assert "held-out markers of camera c2 (" in found.reason
+    assert "are predicted worse with depth" in found.reason
     assert found.held_out is not None
     assert [growth.is_worse for growth in found.held_out.growth.values()] == [False, False, True, False]
     assert found.as_dict()["cameras"]["c2"]["held_out_markers"]["n"] == 2
@@ -231,6 +346,50 @@ def test_poses_that_predict_other_markers_worse_are_not_taken() -> None:
     assert found.held_out.marker_px[1] > found.held_out.marker_px[0]
     # The same depth is believed by markers that agree with it.
     assert refined(room).poses_accepted
+
+
+def test_a_wrong_move_does_not_hide_behind_the_gain_of_the_biases() -> None:
+    room = box_room(np.random.default_rng(25))
+    tiles = room.tiles
+    # The two halves of every image lean to opposite sides, so what turns cameras in one is wrong in the other.
+    odd = (tiles.block // 4096 + tiles.block % 4096) % 2 == 1
+    bent = tiles.inverse + (1.2 + np.where(odd, 0.5, -0.5) * tiles.ray[:, 0]) / FOCAL_BASELINE
+    tiles, free = replace(tiles, inverse=bent), np.zeros((4, 2), dtype=bool)
+
+    def none_held_out(T_world_cam: Array, T_world_target: Array) -> HeldOutMarkers:
+        none = np.empty(0, dtype=np.int64)
+        return HeldOutMarkers(camera=none, marker=none, off=np.empty((0, 2)), off_px=np.empty((0, 2)))
+
+    halves = [replace(half, held_out=none_held_out) for half in room.halves()]
+    halves = [replace(half, train=replace(half.train, H=1e-2 * half.train.H)) for half in halves]
+    trial = on_held_out(halves, tiles, room.sensors, FLOOR_PLANE, free, free, (1.0, 0.0))
+    assert trial.against_bias == ""
+    assert "no better with moved poses" in trial.against_move
+    # Beside depth as it was recorded the move looks well.
+    recorded, alone, moved = trial.figures.depth_mm
+    assert alone < moved < recorded
+
+
+def test_what_could_not_be_tested_is_said() -> None:
+    room = box_room(np.random.default_rng(26))
+    assert "nothing was tested" in refine(room.markers, [], room.tiles, room.sensors, FLOOR_PLANE).reason
+
+    def without_c3(half: MarkerHalf, cameras: list[int]) -> MarkerHalf:
+        def held_out(T_world_cam: Array, T_world_target: Array) -> HeldOutMarkers:
+            of_all = half.held_out(T_world_cam, T_world_target)
+            keep = np.isin(of_all.camera, cameras)
+            parts = {f: getattr(of_all, f)[keep] for f in ("camera", "marker", "off", "off_px")}
+            return HeldOutMarkers(**parts)
+
+        return replace(half, held_out=held_out)
+
+    reasons = [
+        refine(room.markers, [without_c3(h, who) for h in room.halves()], room.tiles, room.sensors, FLOOR_PLANE).reason
+        for who in ([0, 1, 2], [])
+    ]
+    assert reasons[0].startswith("markers and depth that took no part are predicted at least as well")
+    assert "no markers of camera c3 could be held out" in reasons[0]
+    assert reasons[1] == "depth that took no part is predicted at least as well; no markers could be held out"
 
 
 def test_cameras_that_must_stay_do_so_to_the_bit() -> None:
@@ -300,6 +459,21 @@ def test_many_small_tiles_know_no_more_than_neighbours_share() -> None:
     mean_sigma = 1.0 / np.sqrt((1.0 / tiles.sigma**2).sum())
     # 28 x 28 pixels share an error of 0.06 px, and the square has 240 x 240.
     assert mean_sigma == pytest.approx(0.06 / FOCAL_BASELINE * 28 / 240, rel=0.1)
+
+
+def test_bumps_of_a_floor_weigh_more_under_a_grazing_look() -> None:
+    noise = DepthNoise(focal_baseline=FOCAL_BASELINE, sigma_px=1e-6, fixed_sigma_px=0.0, floor_m=0.0)
+    # A level camera 1.2 m above the floor: 1 / z = y / 1.2.
+    q, bump_m = np.array([0.0, 1 / 1.2, 0.0]), 0.002
+    pixels, _ = plane_pixels(q)
+    pixels[:, 1] += 300.0  # below the horizon, at 2.5 to 5 m
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
+    tiles = surface_tiles(pixels, 1.0 / (rays @ q), q, K, noise, n_averaged=1, uneven_m=bump_m)
+    # The floor a bump nearer to the camera, along the same rays.
+    bumped = rays @ (q * 1.2 / (1.2 - bump_m)) - rays @ q
+    assert tiles.alone.mean() == pytest.approx(bumped.mean(), rel=0.05)
+    # As if it were looked at face on it would be this.
+    assert (bump_m * tiles.inverse**2).mean() < 0.5 * bumped.mean()
 
 
 # --- the floor ------------------------------------------------------------------------------------------------------
@@ -390,10 +564,9 @@ def test_equations_of_markers_are_what_the_adjustment_knows() -> None:
         bent = at.T_world_cam.copy()
         bent[0] = exp_se3(np.array([2e-3, 0, 0, 0, 0, 0])) @ bent[0]
         after = half.held_out(bent, at.T_world_target)
-        worse = np.bincount(exact.camera, ((after.off**2) - exact.off**2).sum(axis=1))
-        # 2 mrad are more than a pixel; the other cameras have nothing to do with it.
-        assert worse[0] > 100
-        np.testing.assert_allclose(worse[1:], 0.0, atol=1e-6)
+        worse = np.bincount(exact.camera, (after.off**2 - exact.off**2).sum(axis=1))
+        # 2 mrad are more than a pixel; targets that follow the camera take the others along by less.
+        assert worse[0] > 2 * worse[1:].max()
 
 
 def test_targets_that_depth_does_not_measure_follow_the_cameras() -> None:
@@ -412,14 +585,44 @@ def test_targets_that_depth_does_not_measure_follow_the_cameras() -> None:
 # --- the whole ------------------------------------------------------------------------------------------------------
 
 
-def test_a_simulated_rig_gets_its_biases_and_keeps_its_poses() -> None:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solved:
+    """A simulated rig, solved, with its depth."""
+
+    simulation: Simulation
+    evidence: Evidence
+    average: RigEstimate
+    joint: JointRig
+    pooled: Mapping[str, CameraDepth]
+
+
+@pytest.fixture(scope="module")
+def solved() -> Solved:
     simulation = simulate("demo", seed=1)
     target = marker_target(simulation.faces, simulation.dictionary)
     config = CalibrateConfig(detect=DetectConfig(dictionary=simulation.dictionary))
     evidence = look(simulation.recording, target, config, jobs=2, progress=SILENT)
     average = place_cameras(evidence, NOTHING_KEPT)[0]
     joint = adjust_placed(average, evidence, NOTHING_KEPT)
-    pooled: dict[str, CameraDepth] = pool_recording(simulation.recording, None, jobs=2, progress=SILENT)
+    pooled = pool_recording(simulation.recording, None, jobs=2, progress=SILENT)
+    return Solved(simulation=simulation, evidence=evidence, average=average, joint=joint, pooled=pooled)
+
+
+def test_cameras_that_were_refused_take_no_part(solved: Solved) -> None:
+    depth = DepthConfig(verify=True, refine=True)
+    evidence = replace(solved.evidence, config=replace(solved.evidence.config, depth=depth), pooled=solved.pooled)
+    refused, *left = sorted(solved.joint.rig.cameras)
+    rig = replace(solved.joint.rig, cameras={name: solved.joint.rig.cameras[name] for name in left})
+    told = hear_depth(solved.average, rig, solved.joint, evidence, NOTHING_KEPT).notes
+    assert told["depth_refined"]["accepted"], told["depth_refined"]["reason"]
+    assert told["depth_bias"].keys() == set(left)
+    assert told["depth_refined"]["cameras"].keys() == set(left)
+    assert refused not in told["depth_verified"]
+
+
+def test_a_simulated_rig_gets_its_biases_and_keeps_its_poses(solved: Solved) -> None:
+    simulation, evidence, average, joint = solved.simulation, solved.evidence, solved.average, solved.joint
+    pooled = solved.pooled
     faces = face_depths(evidence, joint.rig, pooled)
     found = refine_with_depth(average, joint, evidence, faces, pooled)
     assert found.accepted, found.reason

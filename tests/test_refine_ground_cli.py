@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -30,9 +31,11 @@ from floor_rooms import (
 
 from aruco.depth_bias import DepthBias
 from aruco.depth_save import CameraDepth, save_depth_data
+from aruco.errors import OutputError
 from aruco.pose_math import Pose, exp_so3, make_pose, pose_distance, pose_text
 from aruco.uncertainty import carried
 from refine_ground_plane import main
+from rigcal import levelling_outputs
 from rigcal.formats.native import read_poses, write_json
 
 TRUE = cameras()
@@ -250,7 +253,8 @@ def test_two_floors_are_not_mixed(rig: Path, tmp_path: Path) -> None:
     assert result.exit_code == 3, result.output
     note = json.loads((tmp_path / "level.json").read_text())["_meta"]["ground_refined"]
     assert list(note["without_correction"]) == ["cam1"]
-    assert "0.4" in note["without_correction"]["cam1"]
+    # The poses are off by 12 mm.
+    assert re.search(r"0\.(39|40|41) m above", note["without_correction"]["cam1"])
     errors = floor_errors(TRUE, read_poses(tmp_path / "level.json"))
     assert max(abs(height) for name, (_, height) in errors.items() if name != "cam1") < 10
 
@@ -539,6 +543,13 @@ BAD_POSES: dict[str, tuple[Callable[[dict[str, Any]], object], Sequence[str]]] =
         ("othercam0", "cam0", "same rig"),
     ),
     "a covariance that is none": (lambda c: c["_meta"]["covariance"].update(cam2=[1, 2]), ("cam2", "covariance")),
+    "a covariance of words": (lambda c: c["_meta"]["covariance"].update(cam2="nan nan"), ("cam2", "in a list")),
+    "poses in millimetres": (
+        lambda c: [
+            c[n].update(pose=pose_text(make_pose(T[:3, :3], 1000 * T[:3, 3]))) for n, T in given_poses().items()
+        ],
+        ("cam", "millimetres", "1000"),
+    ),
     "a bias that is none": (lambda c: c["_meta"].update(depth_bias={"cam2": {"scale": "x"}}), ("cam2", "bias")),
     "a bias beyond sense": (lambda c: c["_meta"].update(depth_bias={"cam2": {"scale": 9, "offset_m": 0}}), ("scale",)),
 }
@@ -661,11 +672,33 @@ def test_a_mirrored_world(rig: Path, store: Path, tmp_path: Path) -> None:
         ("--ransac-threshold", ("-0.01",)),
         ("--height-range", ("1", "0")),
         ("--height-range", ("nan", "0")),
+        ("--height-range", ("0", "inf")),
         ("--target-floor-y", ("inf",)),
+        ("--target-floor-y", ("1e300",)),
+        ("--ransac-threshold", ("2",)),
+        ("--max-rotation-deg", ("1e9",)),
+        ("--stride", ("0",)),
     ],
 )
 def test_options_that_mean_nothing(option: str, value: tuple[str, ...], rig: Path, store: Path, tmp_path: Path) -> None:
-    refused(rig, store, tmp_path, more=(option, *value))
+    result = level(rig, store, tmp_path / "out.json", option, *value)
+    assert result.exit_code == 2
+    assert option in result.output
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_a_stride_beyond_the_image_is_told(rig: Path, store: Path, tmp_path: Path) -> None:
+    refused(rig, store, tmp_path, "--stride", "320 x 180", more=("--stride", 5000))
+
+
+def test_the_input_is_read_once(rig: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Whoever replaces it meanwhile must not get poses of one file under the digest of another.
+    opened: list[str] = []
+    read_bytes, read_text = Path.read_bytes, Path.read_text
+    monkeypatch.setattr(Path, "read_bytes", lambda self: opened.append(self.name) or read_bytes(self))
+    monkeypatch.setattr(Path, "read_text", lambda self, **how: opened.append(self.name) or read_text(self, **how))
+    assert level(rig, store, tmp_path / "level.json").exit_code == 0
+    assert opened == ["rig.json"]
 
 
 def test_outputs_never_replace_an_input_or_each_other(rig: Path, store: Path, tmp_path: Path) -> None:
@@ -682,6 +715,60 @@ def test_outputs_never_replace_an_input_or_each_other(rig: Path, store: Path, tm
     assert_one_sentence(level(rig, own, tmp_path / "x.html", "--plot"), "two outputs")
     assert before == (rig.read_bytes(), own.read_bytes())
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "own.h5", "rig.json"]
+
+
+def test_a_run_that_cannot_write_everything_leaves_nothing(
+    rig: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        if ".html" in path.name:
+            raise OutputError(f"{path}: cannot be written (No space left on device); choose another place.")
+        path.write_bytes(data)
+
+    monkeypatch.setattr(levelling_outputs, "write_whole", full)
+    refused(rig, store, tmp_path, "No space left")
+
+
+def test_a_table_in_a_world_that_has_its_floor_already_is_doubted(rig: Path, tmp_path: Path) -> None:
+    write_json(rig, document(TRUE, world={"up": [0, 1, 0], "origin": "floor"}))
+    flat = store_of(tmp_path / "flat.h5", depth_of(TRUE))
+    assert "that rig.json was levelled on" not in level(rig, flat, tmp_path / "out.json").output
+    table = store_of(tmp_path / "table.h5", depth_of(TRUE, (Wall(1, 0.75), *WALLS)))
+    said = " ".join(level(rig, table, tmp_path / "out.json").output.split())
+    assert "0.75 m above the floor that rig.json was levelled on" in said
+    # A floor that was put elsewhere is where it was put.
+    levelled(rig, flat, tmp_path / "high.json", "--target-floor-y", 0.5)
+    assert "was levelled on" not in level(tmp_path / "high.json", flat, tmp_path / "out.json").output
+
+
+def test_poses_that_are_better_than_their_floor_are_kept_and_it_is_said_why(tmp_path: Path) -> None:
+    biased = store_of(tmp_path / "biased.h5", depth_of(TRUE, disparity_px=0.4))
+    told = []
+    bias = dict.fromkeys(TRUE, DepthBias(focal_baseline=FOCAL_BASELINE).as_dict())
+    for known in ({}, {"depth_bias": bias}):
+        rig = judged_rig(tmp_path / "rig.json", GOOD_POSES, **known)
+        told.append(" ".join(level(rig, biased, tmp_path / "out.json").output.split()))
+        assert "levelled │" not in told[-1]
+        assert "kept │" in told[-1]
+        assert "Kept: the poses of cameras cam0, cam1, cam2, cam3 are known better than their floors" in told[-1]
+        assert "before: when the rig had been moved as a whole only" in told[-1]
+    assert ["calibrate-extrinsics --refine-depth estimates it" in text for text in told] == [True, False]
+
+
+def test_biases_that_share_the_floor_are_remarked(store: Path, tmp_path: Path) -> None:
+    bias = dict.fromkeys(TRUE, DepthBias(focal_baseline=FOCAL_BASELINE).as_dict())
+    write_json(tmp_path / "a.json", document(given_poses(), depth_bias=bias, depth_refined={"accepted": True}))
+    write_json(tmp_path / "b.json", document(given_poses(), depth_bias=bias))
+    remarks = [levelled(tmp_path / n, store, tmp_path / "out.json")["_meta"]["ground_refined"]["remarks"]
+               for n in ("a.json", "b.json")]  # fmt: skip
+    assert [len(r) for r in remarks] == [1, 0]
+
+
+def test_a_pose_that_is_not_rigid_is_told_once_and_what_to_do(rig: Path, store: Path, tmp_path: Path) -> None:
+    change(rig, lambda c: c["cam1"].update(pose=pose_text(2 * np.eye(4))))
+    said = level(rig, store, tmp_path / "out.json").output
+    assert said.count("rig.json") == 1
+    assert "mend its pose" in said
 
 
 def test_places_that_cannot_be_written_are_told_before_the_work(rig: Path, store: Path, tmp_path: Path) -> None:

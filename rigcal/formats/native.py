@@ -6,6 +6,7 @@ Leaves    other people's formats to their own files.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -77,7 +78,12 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    write_whole(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+    write_whole(path, json_bytes(content))
+
+
+def json_bytes(content: Mapping[str, Any]) -> bytes:
+    """What write_json writes."""
+    return (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
 
 
 def read_poses(path: Path) -> dict[str, Pose]:
@@ -100,17 +106,23 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         InputError: There is no such file, it is too large, or it holds something else, numbers that are none among it.
     """
+    return read_json_and_digest(path)[0]
+
+
+def read_json_and_digest(path: Path) -> tuple[dict[str, Any], str]:
+    """The same, and the SHA-256 of the bytes that were read."""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"{path}: over {MAX_FILE_BYTES >> 20} MiB, which is not an extrinsics file.")
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_finite, parse_float=_finite)
+        raw = path.read_bytes()
+        content = json.loads(raw.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON file ({error}); give an extrinsics file.") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: not an extrinsics file: its root is not an object of cameras.")
-    return content
+    return content, hashlib.sha256(raw).hexdigest()
 
 
 def _finite(text: str) -> float:
@@ -134,6 +146,8 @@ def _pose(entry: Any, where: str) -> Pose:
         raise InputError(f"{where} has no pose; it wants sixteen numbers, row by row.")
     try:
         numbers = np.array([float(word) for word in text.split()])
-        return checked_pose(numbers.reshape(4, 4), where)
+        return checked_pose(numbers.reshape(4, 4), "pose")
     except ValueError as error:
-        raise InputError(f"{where}: the pose is not sixteen numbers of a rigid transform ({error}).") from error
+        raise InputError(
+            f"{where} has no sixteen numbers of a rigid transform ({error}); mend its pose or leave the camera out."
+        ) from error

@@ -10,13 +10,15 @@ from rigcal.report.floor_views import FloorFigures, told
 if TYPE_CHECKING:
     from rich.console import Console
 
+_TITLE = "Every camera's floor against the common one; before: when the rig had been moved as a whole only"
+
 
 def show_levelling(out: Console, figures: Sequence[FloorFigures], facts: Sequence[str]) -> None:
     """Print the table, and below it what holds for the whole rig."""
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title="Every camera's floor against the common one", title_justify="left")
+    table = Table(title=_TITLE, title_justify="left")
     table.add_column("camera")
     for name in ("tilt deg\nbefore", "tilt deg\nafter", "height mm\nbefore", "height mm\nafter",
                  "turned by\ndegrees", "raised by\nmm"):  # fmt: skip

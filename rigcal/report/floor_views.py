@@ -158,7 +158,8 @@ def _outcome(correction: FloorCorrection | None, *, doubtful: bool) -> str:
         return "whole rig only"
     if not correction.accepted:
         return "rejected"
-    return "levelled, doubtful" if doubtful else "levelled"
+    word = "kept" if correction.is_kept else "levelled"
+    return f"{word}, doubtful" if doubtful else word
 
 
 def told(value: float, form: str, unit: str = "") -> str:
