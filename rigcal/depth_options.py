@@ -22,7 +22,8 @@ _OPTIONS = (
                       "range and over the image."),
     click.option("--refine-depth", is_flag=True,
                  help="Let depth correct the poses, and estimate each camera's depth bias, which later steps take "
-                      "out. Kept only if depth and markers that were held out fit no worse. Needs --verify-depth."),
+                      "out. Each is used only if it proves better on depth and markers that were held out. Needs "
+                      "--verify-depth."),
     click.option("--depth-model", type=click.Choice(["stereo", "offset"]), default="stereo", show_default=True,
                  help="How depth is biased: stereo cameras by a scale and an error of disparity, others by a scale "
                       "and an offset."),
