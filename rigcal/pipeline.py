@@ -70,9 +70,7 @@ def calibrate(
     return calibrate_seen(at_rest(evidence) if config.still else evidence, kept=kept, listeners=listeners)
 
 
-def calibrate_seen(
-    evidence: Evidence, *, kept: KeptRig = NOTHING_KEPT, listeners: Listeners = NOBODY
-) -> Calibration:
+def calibrate_seen(evidence: Evidence, *, kept: KeptRig = NOTHING_KEPT, listeners: Listeners = NOBODY) -> Calibration:
     """The same, from what the cameras saw; see calibrate for arguments and errors."""
     if kept.T_world_cam and evidence.config.align.enabled:
         raise InputError("Cameras that are kept keep their world, upright or not; do not ask to turn it upright.")

@@ -317,8 +317,7 @@ def test_biased_depth_does_not_spoil_good_poses(with_covariances: bool) -> None:
     assert np.mean(naive) > 1.3
 
 
-@pytest.mark.parametrize("with_covariances", [True, False])
-def test_depth_that_errs_across_the_image_does_not_spoil_good_poses(with_covariances: bool) -> None:
+def test_depth_that_errs_across_the_image_does_not_spoil_good_poses() -> None:
     before, after = [], []
     x, y = ((index - middle) / K[0, 0] for index, middle in zip(np.indices((180, 320))[::-1], K[:2, 2]))
     for seed in range(8):
@@ -330,13 +329,12 @@ def test_depth_that_errs_across_the_image_does_not_spoil_good_poses(with_covaria
             lean_px = LEAN_PX * rng.standard_normal(2)
             leant = 1.0 / (1.0 / depth_of(T) + (lean_px[0] * x + lean_px[1] * y) / (K[0, 0] * BASELINE_M))
             data |= data_of({name: noisy(leant, rng)})
-        known = covariances_of(start, 0.012, 0.0005) if with_covariances else None
+        known = covariances_of(start, 0.012, 0.0005)
         new, _ = refine_ground_from_depth(data, start, CONFIG, covariances=known)
         for poses, errors in ((start, before), (new, after)):
             errors.append(np.median([distance for _, distance in pair_errors(poses, truth).values()]))
-    # The median, as one rig of eight without covariances is taken for a rough one: 1.0; QQ where depth is thought to have
-    # no lean.
-    assert np.median(np.array(after) / before) < 1.2
+    # 1.0; 1.9 where depth is thought to have no lean.
+    assert np.mean(np.array(after) / before) < 1.1
 
 
 def test_a_known_bias_is_taken_out_and_then_believed() -> None:
