@@ -37,9 +37,9 @@ from aruco.pose_math import Array, Pose
 
 # ZED's confidence: the SDK's own default keeps what is at most 95; beyond it is noise.
 MAX_CONFIDENCE = 95
-# Growth of the disparity's error across the image [px a unit of the ray], one sigma: rectification holds to 0.15 mrad
-# (see the bias prior), which is 0.1 px at f = 700 px. Estimated biases do not have it either.
-LEAN_PX = 0.1
+# Growth of the disparity's error across the image [px a unit of the ray], one sigma: what 0.07 mrad of rectification
+# make at f = 700 px. Estimated biases do not have it either.
+LEAN_PX = 0.05
 # Depth noise that no longer tells a floor from a carpet's edge.
 MAX_SIGMA_M = 0.1
 # Real floors and lenses bend; half a slab is never thinner than this.
