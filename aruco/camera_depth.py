@@ -24,7 +24,7 @@ from aruco.pose_math import Array
 MAX_OFF_CENTRE = 0.2
 # Focal lengths over the longer side of the image: fields of view from half a degree to 178.
 FOCAL_SHARES = (0.01, 100.0)
-WORST_CONFIDENCE = 100
+MAX_CONFIDENCE = 100
 # So many measurements of a pixel can be counted in 16 bits, and no more images can have been pooled.
 MAX_POOLED = np.iinfo(np.uint16).max
 _MAX_NAME = 200
@@ -55,7 +55,7 @@ class CameraDepth:
         for name, image in images.items():
             if image is not None and np.shape(image) != self.depth.shape:
                 raise InputError(f"{name} of shape {np.shape(image)} beside depth of {self.depth.shape}.")
-        object.__setattr__(self, "confidence", _counted("confidence", self.confidence, WORST_CONFIDENCE, np.uint8))
+        object.__setattr__(self, "confidence", _counted("confidence", self.confidence, MAX_CONFIDENCE, np.uint8))
         object.__setattr__(self, "count", _counted("count", self.count, MAX_POOLED, np.uint16))
         object.__setattr__(self, "K", _checked_intrinsics(self.K))
         if not 1 <= self.n_frames <= MAX_POOLED:

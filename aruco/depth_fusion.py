@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from aruco.depth_bias import MAX_SCALE, DepthBias, DepthModel
 from aruco.depth_noise import DEFAULT_FOCAL_BASELINE
-from aruco.depth_tiles import FLOOR, Tiles
+from aruco.depth_tiles import FLOOR, MAD_TO_SIGMA, Tiles
 from aruco.pose_math import Array, Pose, exp_se3
 
 # 95 % efficient for clean Gaussian tiles (Holland and Welsch 1977), deaf to things that lie on the floor.
@@ -36,7 +36,6 @@ KAPPA = 2.385
 CURVATURE = 1.206
 MAX_STEPS = 25
 CONVERGED = 1e-3  # of what is known of an unknown
-_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -177,7 +176,7 @@ def residuals(tiles: Tiles, at: Estimate, sensors: Mapping[str, DepthSensor], ma
 def robust_scale(normalised: Array) -> float:
     """How many times larger residuals are than promised, never below one: the mean over a surface needs the promise."""
     good = normalised[np.isfinite(normalised)]
-    return max(1.0, _MAD_TO_SIGMA * float(np.median(np.abs(good)))) if len(good) else 1.0
+    return max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(good)))) if len(good) else 1.0
 
 
 def bias_of(sensor: DepthSensor, parameters: Array, covariance: Array | None = None) -> DepthBias:

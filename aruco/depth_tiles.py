@@ -38,7 +38,7 @@ FLOOR = -1
 # Floors are laid to a few millimetres over two metres, prints bulge by one.
 FLOOR_UNEVEN_M = 0.002
 FACE_UNEVEN_M = 0.001
-_MAD_TO_SIGMA = 1.4826
+MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -331,7 +331,7 @@ def _belongs(off: Array, tile: NDArray[np.int64], sigma: Array) -> tuple[NDArray
     """Which pixels (n,) lie on the surface that most of their tile lies on, and the tiles without such a surface."""
     labels, index = np.unique(tile, return_inverse=True)
     distance = np.abs(off - _medians(off, index)[index])
-    spread = _MAD_TO_SIGMA * _medians(distance, index)
+    spread = MAD_TO_SIGMA * _medians(distance, index)
     roughness = spread / _medians(sigma, index)
     rough = roughness > MAX_ROUGHNESS * max(float(np.median(roughness)), 1e-9)
     return distance <= np.maximum(CLIP * spread, 1e-9)[index], labels[rough]

@@ -16,9 +16,9 @@ from typing import Literal
 
 import numpy as np
 
+from aruco.depth_tiles import MAD_TO_SIGMA
 from aruco.pose_math import Array
 
-_MAD_TO_SIGMA = 1.4826
 # Cauchy's weight at this many sigmas is a half; 95 % efficient on normal errors (Holland and Welsch, 1977).
 _CAUCHY = 2.385
 _STEPS = 20
@@ -154,7 +154,7 @@ def _robust_fit(tiles: TileErrors, drivers: Mapping[str, Array]) -> _Fit:
         root = np.sqrt(loss)
         values = np.linalg.lstsq(scaled * root[:, None], errors * root, rcond=None)[0]
         residuals = (errors - scaled @ values) * to_alone
-        scale = _MAD_TO_SIGMA * float(np.median(np.abs(residuals))) * math.sqrt(n / max(n - p, 1))
+        scale = MAD_TO_SIGMA * float(np.median(np.abs(residuals))) * math.sqrt(n / max(n - p, 1))
         loss = 1.0 / (1.0 + (residuals / (_CAUCHY * max(scale, _TINY))) ** 2)
     # The noise model is a promise of the least there is: residuals may only widen it.
     sigmas = _standard_errors((scaled * loss[:, None]).T @ scaled) * max(scale, 1.0)

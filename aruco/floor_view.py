@@ -23,6 +23,7 @@ from aruco.depth_bias import DepthBias
 from aruco.depth_image import check_depth
 from aruco.depth_mask import mask_edges, mask_grazing
 from aruco.depth_noise import DEFAULT_FOCAL_BASELINE, DepthNoise, bias_prior, independent_count
+from aruco.depth_pool import WORST_CONFIDENCE
 from aruco.errors import InputError
 from aruco.floor_plane import (
     MAX_TILT_DEG,
@@ -35,8 +36,6 @@ from aruco.floor_plane import (
 )
 from aruco.pose_math import Array, Pose
 
-# ZED's confidence: the SDK's own default keeps what is at most 95; beyond it is noise.
-MAX_CONFIDENCE = 95
 # Growth of the disparity's error across the image [px a unit of the ray], one sigma: what 0.07 mrad of rectification
 # make at f = 700 px. Estimated biases do not have it either.
 LEAN_PX = 0.05
@@ -180,7 +179,7 @@ def _untrusted(confidence: Any, shape: tuple[int, ...], where: str) -> Mask:
     confidence = np.asarray(confidence)
     if confidence.shape != shape:
         raise InputError(f"{where}: confidence of shape {confidence.shape} for depth of shape {shape}.")
-    return confidence > MAX_CONFIDENCE
+    return confidence > WORST_CONFIDENCE
 
 
 def level_planes(
@@ -239,8 +238,7 @@ def _level_tiles(samples: FloorSamples, up_cam: Array) -> Mask:
     """Samples (n,) in tiles of the image whose surface is roughly level."""
     if not len(samples.inverse):
         return np.zeros(0, dtype=bool)
-    tile = (samples.pixels // _TILE_PX).astype(np.int64)
-    label = np.unique(tile[:, 1] * 100_000 + tile[:, 0], return_inverse=True)[1].ravel()
+    label = _squares(samples.pixels, _TILE_PX)
     n = int(label.max()) + 1
     r, w = samples.rays, samples.inverse
     moments = [np.bincount(label, r[:, i] * r[:, j], n) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
@@ -251,6 +249,12 @@ def _level_tiles(samples: FloorSamples, up_cam: Array) -> Mask:
     a[full] = np.linalg.solve(M[full], b[full][..., None])[..., 0]
     level = full & (-(a @ up_cam) >= math.cos(math.radians(_TILE_TILT_DEG)) * np.linalg.norm(a, axis=1))
     return np.asarray(level[label])
+
+
+def _squares(pixels: Array, side_px: int) -> NDArray[np.intp]:
+    """The number (n,) of the square of the image that each pixel (n, 2) lies in, counted from zero."""
+    square = (pixels // side_px).astype(np.int64)
+    return np.unique(square[:, 1] * 100_000 + square[:, 0], return_inverse=True)[1].ravel()
 
 
 def _fitted(samples: FloorSamples, band_m: Array, near: Mask, free: Mask) -> SeenPlane | None:
@@ -296,8 +300,7 @@ def _covariances(samples: FloorSamples, a: Array, index: NDArray[np.intp]) -> tu
     modelled = inverse_information * len(index) / independent_count(len(index), stride=samples.stride)
     # Sandwich, clustered by blocks (Liang and Zeger, 1986): what residuals share within a block, whatever the model.
     score = rays * (W * (samples.inverse[index] - rays @ a))[:, None]
-    block = (samples.pixels[index] // _BLOCK_PX).astype(np.int64)
-    label = np.unique(block[:, 1] * 100_000 + block[:, 0], return_inverse=True)[1].ravel()
+    label = _squares(samples.pixels[index], _BLOCK_PX)
     sums = np.stack([np.bincount(label, score[:, i]) for i in range(3)], axis=1)
     seen = inverse_information @ (sums.T @ sums) @ inverse_information
     grown = max(1.0, float(np.trace(np.linalg.solve(modelled, seen))) / 3.0)

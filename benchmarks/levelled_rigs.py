@@ -59,7 +59,7 @@ def depth_rig(seed: int, *, biased: bool) -> DepthRig:
     for k, camera in enumerate(simulation.recording.cameras):
         bias = simulation.depth_bias[camera.name]
         depth = _measured(exact[camera.name], pooled, bias, focal_baseline(camera), seed, k)
-        K = camera.K if camera.depth_K is None else camera.depth_K
+        K = camera.K_depth
         data[camera.name] = {"depth": depth, "K": K, "baseline": camera.baseline_m, "n_frames": N_POOLED}
     place = transform_points(simulation.T_world_target[0], simulation.target.centre_m)
     return DepthRig(T_world_cam=simulation.T_world_cam, camera_data=data, bias=simulation.depth_bias, target_m=place)

@@ -8,25 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from aruco.atomic import check_writable
-from aruco.depth_save import save_depth_data
-from aruco.errors import OutputError
-from aruco.marker_geometry import save_faces
+from aruco.depth_save import CameraDepth, save_depth_data
+from aruco.depth_verify import DepthAgreement
+from aruco.marker_geometry import Face, save_faces
 from aruco.model import Calibration
-from rigcal.cli import beside, refuse_inputs, tell
+from rigcal.cli import beside, refuse_clashes, refuse_inputs, tell
 from rigcal.formats.native import write_extrinsics
 from rigcal.listeners import Listeners
 from rigcal.report.depth_table import show_depth, write_report
 from rigcal.report.terminal import console
-
-if TYPE_CHECKING:
-    from aruco.depth_save import CameraDepth
-    from aruco.depth_verify import DepthAgreement
-    from aruco.marker_geometry import Face
 
 
 @dataclass(eq=False)
@@ -61,9 +55,7 @@ class CalibrateOutputs:
         for path in outputs.paths:
             refuse_inputs(path, [*given["svo"], *given["inputs"]], given["markers"], given["fix"])
             check_writable(path)
-        for one, other in combinations(outputs.paths, 2):
-            if one.resolve() == other.resolve():
-                raise OutputError(f"{one}: two outputs have this name; give each its own.")
+        refuse_clashes(outputs.paths)
         return outputs
 
     @property

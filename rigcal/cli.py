@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,17 @@ def refuse_inputs(output: Path, recordings: Sequence[Path], markers: Path | None
         for folder in goal.parents:
             if (folder == root or root in folder.parents) and (folder / "camera_info.yaml").exists():
                 raise OutputError(f"{output}: lies in the camera folder {folder.name}, an input; choose another place.")
+
+
+def refuse_clashes(outputs: Sequence[Path]) -> None:
+    """No output may replace another.
+
+    Raises:
+        OutputError: Two have one name.
+    """
+    for one, other in combinations(outputs, 2):
+        if one.resolve() == other.resolve():
+            raise OutputError(f"{one}: two outputs have this name; give each its own.")
 
 
 def beside(output: Path, ending: str) -> Path:

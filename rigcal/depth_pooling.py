@@ -7,7 +7,6 @@ Leaves    pooling to aruco.depth_pool.
 from __future__ import annotations
 
 import hashlib
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
@@ -20,6 +19,7 @@ from aruco.depth_pool import DepthFrame, pool_depth, spread_indices
 from aruco.depth_save import CameraDepth, camera_depth
 from aruco.errors import InputError
 from aruco.model import BadFrame, Camera, Progress, Recording
+from rigcal.counter import Counter
 
 
 def require_depth(recording: Recording) -> None:
@@ -64,7 +64,7 @@ def pool_recording(
         InputError: A depth image is none, or in other units.
     """
     chosen = {camera.name: _spread(recording.depth_indices(camera.name).tolist()) for camera in recording.cameras}
-    counter = _Counter(progress, sum(map(len, chosen.values())))
+    counter = Counter(progress, "pooling depth", sum(map(len, chosen.values())))
 
     def pooled(camera: Camera) -> CameraDepth | None:
         reading = _Reading(recording, camera, chosen[camera.name], counter.tick)
@@ -136,16 +136,3 @@ class _Reading:
         told = [f"{len(self._bad)} of {self._n} cannot be read ({self._bad[0]})"] if self._bad else []
         told += [f"{self._empty} of {self._n} hold no measurement"] if self._empty else []
         return "of its depth images " + ", and ".join(told) if told else ""
-
-
-class _Counter:
-    """Counts images over threads."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
-        self._lock = threading.Lock()
-
-    def tick(self) -> None:
-        with self._lock:
-            self._done += 1
-            self._progress.step("pooling depth", self._done, self._total)

@@ -59,7 +59,6 @@ def refine_with_depth(
     max_rotation_deg: float = 5.0,
     max_translation_m: float = 0.1,
     known: Mapping[str, DepthBias] | None = None,
-    seed: int = 0,
 ) -> DepthRefinement:
     """Correct an adjusted rig with its depth, and estimate every camera's depth bias.
 
@@ -74,12 +73,10 @@ def refine_with_depth(
         max_rotation_deg: If any camera were turned farther, no pose is moved.
         max_translation_m: Likewise.
         known: Biases of cameras that an earlier calibration knows; their depth comes without them.
-        seed: Taken for the sake of the other steps; halves are chosen by place, so nothing is left to chance.
 
     Returns:
         The correction, or the poses given and why; either way with the poses of all targets of the rig.
     """
-    del seed
     case, world = _case(average, joint, evidence)
     kept = _measured_frames(case, joint.rig, faces)
     markers, halves = marker_equations(case, kept, world, _beyond(case, joint, evidence, world))

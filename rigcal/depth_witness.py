@@ -71,7 +71,6 @@ def hear_depth(
         baseline_m=wish.baseline_m,
         max_rotation_deg=wish.max_rotation_deg,
         max_translation_m=wish.max_translation_m,
-        seed=evidence.config.seed,
     )
     notes = {"depth_verified": _told(before), "depth_refined": refined.as_dict()}
     for name, why in refined.left_out.items():

@@ -9,7 +9,6 @@ Only views are kept, never images, so memory does not grow with the length of a 
 from __future__ import annotations
 
 import hashlib
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from loguru import logger
 from aruco.model import BadFrame, Camera, Detection, Frame, FrameCounts, Progress, Recording
 from aruco.svo_sync import SyncResult
 from aruco.view_pose import View, solve_view
+from rigcal.counter import Counter
 from rigcal.frames import Moments
 from rigcal.target import Target
 
@@ -90,7 +90,7 @@ def watch(
         name: [(f, int(k)) for f, k in enumerate(moments.groups[:, c]) if k >= 0] for c, name in enumerate(columns)
     }
     tasks = [task for name, pairs in chosen.items() for task in _tasks(by_name[name], pairs, jobs, len(chosen))]
-    counter = _Counter(progress, sum(len(task.frames) for task in tasks))
+    counter = Counter(progress, "looking for markers", sum(len(task.frames) for task in tasks))
 
     def run(task: _Task) -> list[_Outcome]:
         return list(_search(recording, task, target, min_markers, counter, on_frame))
@@ -121,20 +121,6 @@ class _one_thread_each:  # noqa: N801 (a context manager reads like a verb)
         cv2.setNumThreads(self._before)
 
 
-class _Counter:
-    """Counts finished images over threads, and tells them when to stop."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
-        self._lock = threading.Lock()
-        self.stopped = False
-
-    def tick(self) -> None:
-        with self._lock:
-            self._done += 1
-            self._progress.step("looking for markers", self._done, self._total)
-
-
 def _tasks(camera: Camera, pairs: Sequence[tuple[int, int]], jobs: int, n_cameras: int) -> Iterator[_Task]:
     """One task a camera, or as many stretches as keep all threads busy when there are fewer cameras than threads."""
     parts = max(1, -(-jobs // max(n_cameras, 1)))
@@ -149,7 +135,7 @@ def _search(
     task: _Task,
     target: Target,
     min_markers: int,
-    counter: _Counter,
+    counter: Counter,
     on_frame: OnFrame | None,
 ) -> Iterator[_Outcome]:
     for index, frame in zip(task.frames, recording.frames(task.camera.name, task.indices), strict=True):

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from aruco.atomic import check_writable, write_whole
 from aruco.errors import OutputError
-from rigcal.cli import beside
+from rigcal.cli import beside, refuse_clashes
 from rigcal.formats import native
 from rigcal.levelled_rig import Levelling
 from rigcal.report.floor_page import floor_page
@@ -44,9 +43,7 @@ class LevellingOutputs:
                 if path.resolve() == given[option].resolve():
                     flag = option.replace("_", "-")
                     raise OutputError(f"{path}: is --{flag}, an input, which is never changed; choose another name.")
-        for one, other in combinations(outputs.paths, 2):
-            if one.resolve() == other.resolve():
-                raise OutputError(f"{one}: two outputs have this name; give each its own.")
+        refuse_clashes(outputs.paths)
         for path in outputs.paths:
             check_writable(path)
         return outputs

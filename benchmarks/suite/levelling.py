@@ -200,5 +200,5 @@ def _pooled(recording: Recording, camera: Camera) -> dict[str, object]:
     frames = recording.frames(camera.name, range(len(recording.stamps_ns(camera.name))), depth=True)
     images = ((f.stamp_ns, f.depth_m, f.confidence) for f in frames if isinstance(f, Frame) and f.depth_m is not None)
     pooled = pool_depth(images, where=f"camera {camera.name}")
-    K = camera.K if camera.depth_K is None else camera.depth_K
+    K = camera.K_depth
     return {"depth": pooled.depth, "K": K, "baseline": camera.baseline_m, "n_frames": pooled.n_frames}
