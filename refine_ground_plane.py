@@ -3,25 +3,16 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from rigcal.finite import Finite
+from rigcal.icp_options import check_icp_options, icp_config, icp_options
+
 if TYPE_CHECKING:
     from rigcal.levelled_rig import Levelling
-
-
-class Finite(click.FloatRange):
-    """A range of numbers, which NaN is not in."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The number; wrong usage if it is none or out of the range."""
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value} is not a finite number.", param, ctx)
-        return number
 
 
 PARTIAL = 3  # exit code: written, but not every camera was levelled on a floor that it sees itself
@@ -42,9 +33,9 @@ PARTIAL = 3  # exit code: written, but not every camera was levelled on a floor 
 @click.option("--plot-output", type=click.Path(path_type=Path), metavar="FILE.html",
               help="Where the page goes. Default: beside the output, named after it.")  # fmt: skip
 @click.option("--max-rotation-deg", type=Finite(0, 90, min_open=True), default=5.0, show_default=True, metavar="DEG",
-              help="How far one camera may be turned against the others; more is refused.")  # fmt: skip
+              help="How far one camera may be turned against the others, by --icp too; more is refused.")  # fmt: skip
 @click.option("--max-translation-m", type=Finite(0, 10, min_open=True), default=0.1, show_default=True, metavar="M",
-              help="How far one camera may be raised or lowered against the others.")  # fmt: skip
+              help="How far one camera may be raised or lowered against the others, and by --icp moved.")  # fmt: skip
 @click.option("--ransac-threshold", type=Finite(0, 1, min_open=True), metavar="M",
               help="How near a plane depth must be to be part of it. Default: by the noise of depth.")  # fmt: skip
 @click.option("--height-range", type=Finite(-1000, 1000), nargs=2, metavar="MIN MAX",
@@ -54,6 +45,7 @@ PARTIAL = 3  # exit code: written, but not every camera was levelled on a floor 
               help="Use every Nth row and column of the depth.")  # fmt: skip
 @click.option("--target-floor-y", type=Finite(-1000, 1000), default=0.0, show_default=True, metavar="M",
               help="Where the floor is put on the y axis.")  # fmt: skip
+@icp_options
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="For every random choice.")
 @click.option("--debug", is_flag=True, help="Say more about what happens.")
 @click.version_option(package_name="rigcal")
@@ -61,16 +53,18 @@ def main(**given: Any) -> None:
     """Level a calibration on the real floor, seen by the rig's own depth.
 
     The whole rig is turned and shifted onto the floor that its cameras agree on; then each camera's pitch, roll and
-    height are corrected as far as the floor knows them better than its pose. Yaw, x and z stay.
+    height are corrected as far as the floor knows them better than its pose. Yaw, x and z stay, unless --icp asks the
+    clouds of the cameras for them too.
 
     Exit codes: 0 all cameras levelled, 1 an error, 2 wrong usage, 3 written, but some camera sees no floor, or one that
-    contradicts the others' or its own pose: see its warnings.
+    contradicts the others' or its own pose: see its warnings; or clouds could not be registered at all.
     """
     if given["plot"] is False and given["plot_output"]:
         raise click.UsageError("--plot-output names a page that --no-plot forbids: give one of them")
     heights = given["height_range"]
     if heights and heights[0] >= heights[1]:
         raise click.UsageError("--height-range wants the lower height first")
+    check_icp_options(click.get_current_context())
     from rigcal import cli
 
     with cli.telling_errors(debug=given["debug"]):
@@ -80,6 +74,7 @@ def main(**given: Any) -> None:
 
 def _run(given: dict[str, Any]) -> Levelling:
     from aruco.ground_plane import GroundPlaneConfig
+    from rigcal.icp_refining import register_clouds
     from rigcal.levelling import level_files
     from rigcal.levelling_outputs import LevellingOutputs
 
@@ -92,8 +87,11 @@ def _run(given: dict[str, Any]) -> Levelling:
         target_floor_y=given["target_floor_y"],
         seed=given["seed"],
     )
+    registering = icp_config(given) if given["icp"] else None
     outputs = LevellingOutputs.asked_for(given)
     levelling = level_files(given["input_extrinsics"], given["input_depth"], config)
+    if registering is not None:
+        levelling = register_clouds(levelling, registering)
     outputs.write(levelling)
     _tell(levelling, outputs.paths)
     return levelling
@@ -101,10 +99,15 @@ def _run(given: dict[str, Any]) -> Levelling:
 
 def _tell(levelling: Levelling, written: list[Path]) -> None:
     from rigcal.report.floor_table import show_levelling
+    from rigcal.report.icp_table import remarks_of, sheets_of, show_registration
     from rigcal.report.terminal import console
 
     out = console()
     show_levelling(out, levelling.figures, levelling.facts)
+    found = levelling.registration
+    if found is not None:
+        sheets = sheets_of(found.metrics, levelling.T_world_cam.keys(), found.given_bias)
+        show_registration(out, sheets, remarks_of(found.metrics), found.fact)
     for path in written:
         out.print(f"Wrote {path}", markup=False)
 

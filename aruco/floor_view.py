@@ -124,14 +124,14 @@ def floor_samples(camera: str, data: Mapping[str, Any], stride: int) -> FloorSam
             f"{where}: want its depth and the K of that depth, got {', '.join(sorted(data)) or 'nothing'}."
         )
     depth = check_depth(data["depth"], where)
-    K = _checked_intrinsics(data["K"], depth.shape, where)
+    K = checked_intrinsics(data["K"], depth.shape, where)
     _check_stride(stride, depth.shape, where)
     baseline = data.get("baseline")
     bias = data.get("bias") or DepthBias()
     focal_baseline = float(K[0, 0]) * float(baseline) if baseline else bias.focal_baseline
     noise = DepthNoise(focal_baseline=focal_baseline)
     drop = mask_edges(depth, focal_baseline=focal_baseline, focal_px=float(K[0, 0])) | mask_grazing(depth, K)
-    drop |= _untrusted(data.get("confidence"), depth.shape, where)
+    drop |= untrusted(data.get("confidence"), depth.shape, where)
     pixels, z = depth_samples(depth, K, stride, mask=~drop)
     true = bias.corrected(z)
     sigma_z = noise.averaged_sigma_m(z, int(data.get("n_frames") or 1))
@@ -150,7 +150,8 @@ def floor_samples(camera: str, data: Mapping[str, Any], stride: int) -> FloorSam
     )
 
 
-def _checked_intrinsics(K: Any, shape: tuple[int, ...], where: str) -> Array:
+def checked_intrinsics(K: Any, shape: tuple[int, ...], where: str) -> Array:
+    """The camera matrix (3, 3) of a depth image of this shape; InputError where it is none or of another size."""
     matrix = np.array(K, dtype=np.float64)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise InputError(f"{where}: K is not a camera matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]].")
@@ -173,7 +174,8 @@ def _check_stride(stride: int, shape: tuple[int, ...], where: str) -> None:
         )
 
 
-def _untrusted(confidence: Any, shape: tuple[int, ...], where: str) -> Mask:
+def untrusted(confidence: Any, shape: tuple[int, ...], where: str) -> Mask:
+    """Pixels (h, w) whose confidence is too poor; none where there is no confidence."""
     if confidence is None:
         return np.zeros(shape, dtype=bool)
     confidence = np.asarray(confidence)
@@ -208,7 +210,7 @@ def level_planes(
     free &= heights < 0
     if height_range is not None:
         free &= (heights + centre_height_m >= height_range[0]) & (heights + centre_height_m <= height_range[1])
-    band = _bands(samples, np.abs(heights), threshold_m)
+    band = plane_bands(samples, np.abs(heights), threshold_m)
     planes: list[SeenPlane] = []
     least = max(MIN_INLIERS, MIN_SHARE * len(points))
     for _ in range(MAX_PLANES):
@@ -217,7 +219,7 @@ def level_planes(
         if found is None:
             break
         near = free & (np.abs(found.distances(points)) <= band)
-        plane = _fitted(samples, band, near, free)
+        plane = fitted_plane(samples, band, near, free)
         if plane is None or len(plane.inliers) < least:
             break
         # Noise has tails: what is left of a surface must not be found as another one.
@@ -227,7 +229,8 @@ def level_planes(
     return sorted(planes, key=lambda plane: -len(plane.inliers))
 
 
-def _bands(samples: FloorSamples, below_m: Array, threshold_m: float | None) -> Array:
+def plane_bands(samples: FloorSamples, below_m: Array, threshold_m: float | None) -> Array:
+    """How far (n,) [m] samples may be from a plane that is ``below_m`` (n,) from the camera, along its normal."""
     if threshold_m is not None:
         return np.full(len(samples.inverse), threshold_m)
     # Depth noise of a level surface moves a point off its plane by sigma_z times the ray's slope towards it.
@@ -238,7 +241,7 @@ def _level_tiles(samples: FloorSamples, up_cam: Array) -> Mask:
     """Samples (n,) in tiles of the image whose surface is roughly level."""
     if not len(samples.inverse):
         return np.zeros(0, dtype=bool)
-    label = _squares(samples.pixels, _TILE_PX)
+    label = squares(samples.pixels, _TILE_PX)
     n = int(label.max()) + 1
     r, w = samples.rays, samples.inverse
     moments = [np.bincount(label, r[:, i] * r[:, j], n) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
@@ -251,13 +254,13 @@ def _level_tiles(samples: FloorSamples, up_cam: Array) -> Mask:
     return np.asarray(level[label])
 
 
-def _squares(pixels: Array, side_px: int) -> NDArray[np.intp]:
+def squares(pixels: Array, side_px: int) -> NDArray[np.intp]:
     """The number (n,) of the square of the image that each pixel (n, 2) lies in, counted from zero."""
     square = (pixels // side_px).astype(np.int64)
     return np.unique(square[:, 1] * 100_000 + square[:, 0], return_inverse=True)[1].ravel()
 
 
-def _fitted(samples: FloorSamples, band_m: Array, near: Mask, free: Mask) -> SeenPlane | None:
+def fitted_plane(samples: FloorSamples, band_m: Array, near: Mask, free: Mask) -> SeenPlane | None:
     """The weighted least-squares plane on the free samples within the band of it, by fixed-point iteration.
 
     Three points leave the far end of a floor centimetres off: the band starts wider than it ends.
@@ -272,7 +275,7 @@ def _fitted(samples: FloorSamples, band_m: Array, near: Mask, free: Mask) -> See
         if np.linalg.cond(information) > 1e12:
             return None
         a = np.linalg.solve(information, rays.T @ (W * samples.inverse[near]))
-        near = free & (np.abs(_distances(samples, a)) <= widen * band_m)
+        near = free & (np.abs(plane_distances(samples, a)) <= widen * band_m)
     index = np.nonzero(near)[0]
     if len(index) < MIN_INLIERS:
         return None
@@ -282,12 +285,12 @@ def _fitted(samples: FloorSamples, band_m: Array, near: Mask, free: Mask) -> See
         noise=noise,
         bias=bias,
         inliers=index,
-        rms_m=float(np.sqrt(np.mean(_distances(samples, a)[index] ** 2))),
+        rms_m=float(np.sqrt(np.mean(plane_distances(samples, a)[index] ** 2))),
         share=len(index) / len(samples.inverse),
     )
 
 
-def _distances(samples: FloorSamples, a: Array) -> Array:
+def plane_distances(samples: FloorSamples, a: Array) -> Array:
     """Signed distances (n,) of the samples from a plane [m], positive on the camera's side."""
     return (samples.inverse - samples.rays @ a) / (samples.inverse * float(np.linalg.norm(a)))
 
@@ -300,7 +303,7 @@ def _covariances(samples: FloorSamples, a: Array, index: NDArray[np.intp]) -> tu
     modelled = inverse_information * len(index) / independent_count(len(index), stride=samples.stride)
     # Sandwich, clustered by blocks (Liang and Zeger, 1986): what residuals share within a block, whatever the model.
     score = rays * (W * (samples.inverse[index] - rays @ a))[:, None]
-    label = _squares(samples.pixels[index], _BLOCK_PX)
+    label = squares(samples.pixels[index], _BLOCK_PX)
     sums = np.stack([np.bincount(label, score[:, i]) for i in range(3)], axis=1)
     seen = inverse_information @ (sums.T @ sums) @ inverse_information
     grown = max(1.0, float(np.trace(np.linalg.solve(modelled, seen))) / 3.0)

@@ -69,10 +69,20 @@ class RigFile:
         """SHA-256 of the depth that the rig was levelled with before."""
         return self._levelled("provenance", "inputs_sha256", "depth")
 
+    @property
+    def registered_with(self) -> str | None:
+        """SHA-256 of the depth whose clouds were registered before."""
+        if self._told("icp_refined", "success") is not True:
+            return None
+        return self._told("icp_refined", "provenance", "inputs_sha256", "depth")
+
     def _levelled(self, *keys: str) -> Any:
         """What an earlier levelling says of itself."""
+        return self._told("ground_refined", *keys)
+
+    def _told(self, *keys: str) -> Any:
         found: Any = self.meta
-        for key in ("ground_refined", *keys):
+        for key in keys:
             found = found.get(key) if isinstance(found, dict) else None
         return found
 

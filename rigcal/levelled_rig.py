@@ -1,7 +1,8 @@
 """A rig on its floor: what was found, and what is derived from it for the file, the terminal and the page.
 
 Owns      the result of levelling; who was levelled on a floor of its own, and who was not.
-Leaves    the order of the steps to levelling, layouts to levelled_file and ground_note, drawing to the room report.
+Leaves    the order of the steps to levelling and icp_refining, layouts to levelled_file, ground_note and icp_note,
+          drawing to the room report.
 """
 
 from __future__ import annotations
@@ -12,14 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from aruco.depth_bias import DepthBias
 from aruco.depth_mask import mask_edges
 from aruco.depth_noise import DepthNoise
 from aruco.ground_plane import GroundPlaneConfig, GroundPlaneMetrics
 from aruco.pose_math import Array, Pose
 from rigcal.ground_doubts import GroundDoubts, ground_doubts
 from rigcal.ground_note import DepthFile, facts_of, ground_note
+from rigcal.icp_note import Registration, icp_note, registered_content
 from rigcal.levelled_file import RigFile, levelled_content
 from rigcal.report.floor_views import FloorFigures, FloorView, floor_figures, floor_view
+from rigcal.report.icp_views import CloudView, cloud_view
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,6 +36,7 @@ class Levelling:
     config: GroundPlaneConfig
     T_world_cam: Mapping[str, Pose]  # on the floor
     metrics: GroundPlaneMetrics
+    registration: Registration | None = None  # of its clouds; None: not asked for
 
     @property
     def partial(self) -> dict[str, str]:
@@ -44,8 +49,9 @@ class Levelling:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every camera was levelled on the floor that it sees itself, and none is contradicted by it."""
-        return not self.partial and not self.doubts.cameras
+        """Whether all was done that was asked for, to every camera by the floor that it sees itself and that agrees."""
+        failed = self.registration is not None and not self.registration.metrics.success
+        return not self.partial and not self.doubts.cameras and not failed
 
     @property
     def doubts(self) -> GroundDoubts:
@@ -78,12 +84,27 @@ class Levelling:
         return ground_note(self.given, self.depth_file, self.metrics, self.partial, self.doubts, self.config)
 
     @property
+    def icp_note(self) -> dict[str, Any] | None:
+        """The entry ``_meta.icp_refined``; None where that was not asked for."""
+        if self.registration is None:
+            return None
+        return icp_note(self.given, self.depth_file, self.registration)
+
+    @property
     def content(self) -> dict[str, Any]:
         """The new extrinsics file."""
         corrected = [name for name, c in self.metrics.corrections.items() if c.accepted]
-        return levelled_content(
-            self.given, self.T_world_cam, self.covariance, self.note, self.doubts, corrected=corrected
+        found, note = self.registration, self.icp_note
+        if found is None or note is None:
+            return levelled_content(
+                self.given, self.T_world_cam, self.covariance, self.note, self.doubts, corrected=corrected
+            )
+        covariance = found.covariance(self.covariance)
+        corrected = [*corrected, *found.moved]
+        content = levelled_content(
+            self.given, found.T_world_cam, covariance, self.note, self.doubts, corrected=corrected
         )
+        return registered_content(content, found, note)
 
     @property
     def facts(self) -> tuple[str, ...]:
@@ -112,17 +133,42 @@ class Levelling:
         """What is drawn of each camera with depth: without bias, and without the wrong depth beside edges."""
         return tuple(self._view(name, T) for name, T in self.T_before_cam.items() if name in self.data)
 
+    def clouds(self) -> tuple[CloudView, ...]:
+        """What is drawn of each camera with depth before and after registration; nothing where there was none."""
+        found = self.registration
+        if found is None or not found.metrics.success:
+            return ()
+        return tuple(
+            cloud_view(
+                name,
+                self._trusted(name, found.given_bias.get(name)),
+                self._trusted(name, found.bias.get(name)),
+                np.asarray(self.data[name]["K"], dtype=np.float64),
+                T_before_cam=found.T_start_cam[name],
+                T_after_cam=found.T_world_cam[name],
+            )
+            for name in sorted(self.data)
+        )
+
     def _view(self, camera: str, T_before_cam: Pose) -> FloorView:
         data = self.data[camera]
-        depth, K = data["depth"], np.asarray(data["K"], dtype=np.float64)
-        focal_baseline = float(K[0, 0]) * data["baseline"] if data["baseline"] else None
-        unbiased = data["bias"].corrected(depth) if "bias" in data else depth
+        focal_baseline = self._focal_baseline(camera)
         return floor_view(
             camera,
-            np.where(mask_edges(depth, focal_baseline=focal_baseline, focal_px=float(K[0, 0])), np.nan, unbiased),
-            K,
+            self._trusted(camera, data.get("bias")),
+            np.asarray(data["K"], dtype=np.float64),
             T_before_cam=T_before_cam,
             T_after_cam=self.T_world_cam[camera],
             floor=self.metrics.camera_planes.get(camera),
             sigma_m=lambda z: DepthNoise(focal_baseline=focal_baseline).averaged_sigma_m(z, data["n_frames"]),
         )
+
+    def _trusted(self, camera: str, bias: DepthBias | None) -> Array:
+        """A camera's depth (H, W) [m] without a bias, NaN beside edges."""
+        depth, K = self.data[camera]["depth"], np.asarray(self.data[camera]["K"], dtype=np.float64)
+        wrong = mask_edges(depth, focal_baseline=self._focal_baseline(camera), focal_px=float(K[0, 0]))
+        return np.where(wrong, np.nan, depth if bias is None else bias.corrected(depth))
+
+    def _focal_baseline(self, camera: str) -> float | None:
+        data = self.data[camera]
+        return float(data["K"][0][0]) * data["baseline"] if data["baseline"] else None

@@ -17,6 +17,8 @@ from rigcal.cli import beside, refuse_clashes
 from rigcal.formats import native
 from rigcal.levelled_rig import Levelling
 from rigcal.report.floor_page import floor_page
+from rigcal.report.icp_page import icp_section
+from rigcal.report.icp_table import remarks_of, sheets_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +63,9 @@ class LevellingOutputs:
         """
         contents: dict[Path, bytes] = {}
         if self.metrics is not None:
+            icp = levelling.icp_note
             note = {"format": "rigcal.ground_refined", "version": 1, **levelling.note}
+            note |= {} if icp is None else {"icp_refined": icp}
             contents[self.metrics] = native.json_bytes(note)
         if self.page is not None:
             contents[self.page] = _page(levelling).encode()
@@ -88,6 +92,9 @@ def _write_all(contents: Mapping[Path, bytes]) -> None:
 
 
 def _page(levelling: Levelling) -> str:
-    return floor_page(
-        levelling.views(), levelling.figures, levelling.facts, up_y=levelling.up_y, floor_y=levelling.floor_y
-    )
+    world = {"up_y": levelling.up_y, "floor_y": levelling.floor_y}
+    found, more = levelling.registration, ()
+    if found is not None:
+        sheets = sheets_of(found.metrics, levelling.T_world_cam.keys(), found.given_bias)
+        more = icp_section(levelling.clouds(), sheets, remarks_of(found.metrics), found.fact, **world)
+    return floor_page(levelling.views(), levelling.figures, levelling.facts, **world, more=more)

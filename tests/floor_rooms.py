@@ -17,6 +17,12 @@ K = np.array([[FOCAL_PX, 0.0, 159.5], [0.0, FOCAL_PX, 89.5], [0.0, 0.0, 1.0]])
 FOCAL_BASELINE = FOCAL_PX * BASELINE_M
 
 
+def zoomed(zoom: int) -> Array:
+    """K (3, 3) of an image of so many times the size."""
+    half = (zoom - 1) / 2
+    return np.array([[zoom, 0.0, half], [0.0, zoom, half], [0.0, 0.0, 1.0]]) @ K
+
+
 @dataclass(frozen=True, slots=True)
 class Wall:
     """The rectangle on which one coordinate has a value and the other two lie in ranges [m]."""
@@ -39,7 +45,9 @@ def cameras(count: int = 4, *, height_m: float = 1.6, aim_y: float = 0.3) -> dic
     return {f"cam{k}": look_at(place, np.array([0.0, aim_y, 0.0])) for k, place in enumerate(places)}
 
 
-def depth_image(T_world_cam: Pose, walls: Sequence[Wall], *, seed: int = 0, disparity_px: float = 0.0) -> Array:
+def depth_image(
+    T_world_cam: Pose, walls: Sequence[Wall], *, seed: int = 0, disparity_px: float = 0.0, zoom: int = 1
+) -> Array:
     """Depth (HEIGHT, WIDTH) [m] along the optical axis, with noise of 0.03 px of disparity, NaN where nothing is met.
 
     Args:
@@ -47,9 +55,11 @@ def depth_image(T_world_cam: Pose, walls: Sequence[Wall], *, seed: int = 0, disp
         walls: What it may see.
         seed: Of the noise.
         disparity_px: Added to every disparity: too near by z^2 / (f B) for each pixel.
+        zoom: So many times the size, with eyes as much nearer together.
     """
-    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    rays = np.stack([(u - K[0, 2]) / FOCAL_PX, (v - K[1, 2]) / FOCAL_PX, np.ones(u.shape)], axis=-1)
+    u, v = np.meshgrid(np.arange(zoom * WIDTH), np.arange(zoom * HEIGHT))
+    (fx, _, cx), (_, fy, cy), _ = zoomed(zoom)
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(u.shape)], axis=-1)
     turned, centre = rays @ T_world_cam[:3, :3].T, T_world_cam[:3, 3]
     depth = np.full(u.shape, np.inf)
     for wall in walls:
@@ -65,15 +75,15 @@ def depth_image(T_world_cam: Pose, walls: Sequence[Wall], *, seed: int = 0, disp
 
 
 def depth_of(
-    T_world_cam: Mapping[str, Pose], walls: Sequence[Wall] = ROOM, *, disparity_px: float = 0.0
+    T_world_cam: Mapping[str, Pose], walls: Sequence[Wall] = ROOM, *, disparity_px: float = 0.0, zoom: int = 1
 ) -> dict[str, CameraDepth]:
     """Every camera's depth, as a store keeps it."""
     return {
         name: CameraDepth(
-            depth=depth_image(T, walls, seed=k, disparity_px=disparity_px).astype(np.float32),
-            K=K,
+            depth=depth_image(T, walls, seed=k, disparity_px=disparity_px, zoom=zoom).astype(np.float32),
+            K=zoomed(zoom),
             n_frames=20,
-            baseline_m=BASELINE_M,
+            baseline_m=BASELINE_M / zoom,
         )
         for k, (name, T) in enumerate(T_world_cam.items())
     }

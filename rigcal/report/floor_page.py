@@ -1,27 +1,24 @@
 """A page about a levelled rig: the rig on its floor, heights before and after in 3D and as maps, a table of figures.
 
 Owns      what is drawn, and that it is one self-contained HTML file.
-Leaves    which points are floor, and the figures, to floor_views.
+Leaves    which points are floor, and the figures, to floor_views, what every page has to drawing.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from aruco.pose_math import Array, transform_points
+from rigcal.report.drawing import LEGEND, MARGIN, DrawnWorld, as_html, cloud, colours_of, some
 from rigcal.report.floor_views import FloorFigures, FloorView, common_limit_mm, told
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-# Told apart by people who see red and green alike (Okabe and Ito), reused beyond eight cameras.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8A7A00")
 POINTS_A_CAMERA = 4000  # of each 3D view: enough to see a surface, few enough to turn it smoothly
 FRUSTUM_SHARE = 0.12  # of how far a camera sees; rigs stand on desks and in halls
 
@@ -29,10 +26,6 @@ _BEFORE = (
     "Before: the rig has been turned and shifted as a whole only. After: each camera's pitch, roll and height have "
     "been corrected too. Heights are drawn larger than life."
 )
-# From farther away than by default, which cuts the nearest corner off.
-_EYE = {"eye": {"x": 1.65, "y": 1.65, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.1}}
-_MARGIN = {"l": 0, "r": 0, "t": 40, "b": 0}
-_LEGEND = {"itemsizing": "constant", "title": {"text": "camera"}}
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 1180px; padding: 0 1em; color: #222; }
 h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; }
@@ -48,6 +41,7 @@ def floor_page(
     *,
     up_y: int,
     floor_y: float,
+    more: Sequence[str] = (),
 ) -> str:
     """The page as HTML.
 
@@ -57,9 +51,10 @@ def floor_page(
         facts: Sentences about the whole rig, told first.
         up_y: 1 if the world's y axis points up, -1 if down.
         floor_y: Where the floor is in the levelled world.
+        more: Further sections, as HTML.
     """
     limit_mm = common_limit_mm(views, up_y, floor_y)
-    colours = {view.camera: COLOURS[k % len(COLOURS)] for k, view in enumerate(views)}
+    colours = colours_of([view.camera for view in views])
     world = DrawnWorld(up_y=up_y, floor_y=floor_y)
     return "\n".join(
         [
@@ -69,32 +64,15 @@ def floor_page(
             "<h2>Every camera's floor against the common one</h2>",
             figures_table(figures),
             "<h2>The levelled rig</h2>",
-            _html(rig_figure(views, colours, world), "rig", with_library=True),
+            as_html(rig_figure(views, colours, world), "rig", with_library=True),
             f"<h2>Heights of the floor, before and after</h2><p>{_BEFORE}</p>",
-            _html(heights_figure(views, colours, world, limit_mm), "heights"),
+            as_html(heights_figure(views, colours, world, limit_mm), "heights"),
             "<h2>Height maps</h2><p>The floor's pixels in each camera's image; grey is no floor.</p>",
-            _html(maps_figure(views, world, limit_mm), "maps"),
+            as_html(maps_figure(views, world, limit_mm), "maps"),
+            *more,
             "</body></html>\n",
         ]
     )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnWorld:
-    """Where things of the levelled world go in a picture whose third axis points up."""
-
-    up_y: int
-    floor_y: float
-
-    def drawn(self, points: Array) -> tuple[Array, Array, Array]:
-        """x, z and height above the floor [m] of points (n, 3)."""
-        return points[:, 0], points[:, 2], self.up_y * (points[:, 1] - self.floor_y)
-
-    def scene(self, **height_axis: Any) -> dict[str, Any]:
-        """A scene whose horizontal axes are x and z."""
-        # x, z, y is left-handed where y points up: the z axis runs the other way, or left and right would be exchanged.
-        z_axis = {"title": {"text": "z m"}, **({"autorange": "reversed"} if self.up_y > 0 else {})}
-        return {"xaxis": {"title": {"text": "x m"}}, "yaxis": z_axis, "zaxis": height_axis, "camera": _EYE}
 
 
 def figures_table(figures: Sequence[FloorFigures]) -> str:
@@ -125,16 +103,16 @@ def rig_figure(views: Sequence[FloorView], colours: Mapping[str, str], world: Dr
     figure = go.Figure()
     for view in views:
         colour, name = colours[view.camera], escape(view.camera)
-        points = _some(view.points_cam[np.isfinite(view.points_cam).all(axis=-1)])
+        points = some(view.points_cam[np.isfinite(view.points_cam).all(axis=-1)], POINTS_A_CAMERA)
         x, z, height = world.drawn(transform_points(view.T_after_cam, points))
-        figure.add_trace(_cloud(x, z, height, colour, name, "height %{z:.2f} m"))
+        figure.add_trace(cloud(x, z, height, colour, name, "height %{z:.2f} m"))
         x, z, height = world.drawn(_frustum(view))
         line = {"color": colour, "width": 4}
         figure.add_trace(
             go.Scatter3d(x=x, y=z, z=height, mode="lines", line=line, legendgroup=name, showlegend=False, name=name)
         )
     scene = world.scene(title={"text": "height m"})
-    figure.update_layout(scene={**scene, "aspectmode": "data"}, height=620, margin=_MARGIN, legend=_LEGEND)
+    figure.update_layout(scene={**scene, "aspectmode": "data"}, height=620, margin=MARGIN, legend=LEGEND)
     return figure
 
 
@@ -162,15 +140,15 @@ def heights_figure(
         horizontal_spacing=0.02,
     )
     for view in views:
-        points = _some(view.points_cam[view.is_floor])
+        points = some(view.points_cam[view.is_floor], POINTS_A_CAMERA)
         for column, T_world_cam in enumerate((view.T_before_cam, view.T_after_cam), start=1):
             x, z, height = world.drawn(transform_points(T_world_cam, points))
-            cloud = _cloud(x, z, 1e3 * height, colours[view.camera], escape(view.camera), "%{z:.1f} mm")
-            cloud.showlegend = column == 1
-            figure.add_trace(cloud, row=1, col=column)
+            trace = cloud(x, z, 1e3 * height, colours[view.camera], escape(view.camera), "%{z:.1f} mm")
+            trace.showlegend = column == 1
+            figure.add_trace(trace, row=1, col=column)
     heights = {"title": {"text": "height mm"}, "range": [-1.5 * limit_mm, 1.5 * limit_mm]}
     scene = {**world.scene(**heights), "aspectmode": "manual", "aspectratio": {"x": 1.2, "y": 1.2, "z": 0.55}}
-    figure.update_layout(scene=scene, scene2=scene, height=560, margin=_MARGIN, legend=_LEGEND)
+    figure.update_layout(scene=scene, scene2=scene, height=560, margin=MARGIN, legend=LEGEND)
     return figure
 
 
@@ -196,30 +174,5 @@ def maps_figure(views: Sequence[FloorView], world: DrawnWorld, limit_mm: float) 
     figure.update_yaxes(visible=False, autorange="reversed")
     bar = {"title": {"text": "mm"}, "lenmode": "pixels", "len": 340, "y": 1, "yanchor": "top"}
     scale = {"colorscale": "RdBu_r", "cmin": -limit_mm, "cmax": limit_mm, "colorbar": bar}
-    figure.update_layout(coloraxis=scale, plot_bgcolor="#d0d0d0", height=60 + 340 * rows, margin=_MARGIN)
+    figure.update_layout(coloraxis=scale, plot_bgcolor="#d0d0d0", height=60 + 340 * rows, margin=MARGIN)
     return figure
-
-
-def _cloud(x: Array, y: Array, z: Array, colour: str, name: str, hover: str) -> go.Scatter3d:
-    import plotly.graph_objects as go
-
-    small = (np.asarray(values, dtype=np.float32) for values in (x, y, z))
-    return go.Scatter3d(
-        **dict(zip("xyz", small)),
-        mode="markers",
-        marker={"size": 1.6, "color": colour},
-        name=name,
-        legendgroup=name,
-        hovertemplate=f"{name}: {hover}<extra></extra>",
-    )
-
-
-def _some(points: Array) -> Array:
-    """At most POINTS_A_CAMERA of points (n, 3), evenly from all of them."""
-    step = max(1, math.ceil(len(points) / POINTS_A_CAMERA))
-    return points[::step]
-
-
-def _html(figure: go.Figure, name: str, *, with_library: bool = False) -> str:
-    """A figure as part of a page; its name makes the same figure give the same bytes."""
-    return figure.to_html(full_html=False, include_plotlyjs=with_library, div_id=name)

@@ -71,13 +71,10 @@ def floor_view(
         floor: Its floor in the world of the final poses; None if it sees none.
         sigma_m: Standard deviation [m] of depth [m].
     """
-    step = max(1, math.ceil(depth_m.shape[1] / WIDTH_PX))
-    rows, columns = (np.arange(step // 2, size, step) for size in depth_m.shape)
-    z = np.asarray(depth_m[np.ix_(rows, columns)], dtype=np.float64)
-    z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
-    K_inv = np.linalg.inv(K)
-    rays = np.stack([*np.meshgrid(columns, rows), np.ones_like(z)], axis=-1) @ K_inv.T
+    step = grid_step(depth_m, WIDTH_PX)
+    rays, z = depth_grid(depth_m, K, step)
     points = rays * z[..., None]
+    K_inv = np.linalg.inv(K)
     bottom, right = (size - 1 for size in depth_m.shape)
     corners = np.array([[0, 0, 1], [right, 0, 1], [right, bottom, 1], [0, bottom, 1]]) @ K_inv.T
     if floor is None:
@@ -95,6 +92,20 @@ def floor_view(
         T_before_cam=T_before_cam,
         T_after_cam=T_after_cam,
     )
+
+
+def grid_step(depth_m: Array, width_px: int) -> int:
+    """Every so many pixels make a grid that is no wider than this."""
+    return max(1, math.ceil(depth_m.shape[1] / width_px))
+
+
+def depth_grid(depth_m: Array, K: Array, step: int) -> tuple[Array, Array]:
+    """Rays (h, w, 3) with z = 1 and depth (h, w) [m], NaN where there is none, of every step-th pixel each way."""
+    rows, columns = (np.arange(step // 2, size, step) for size in depth_m.shape)
+    z = np.asarray(depth_m[np.ix_(rows, columns)], dtype=np.float64)
+    z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
+    rays = np.stack([*np.meshgrid(columns, rows), np.ones_like(z)], axis=-1) @ np.linalg.inv(K).T
+    return rays, z
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,102 @@
+"""What clouds say of relative poses, and of what they say nothing.
+
+Owns      PairInformation, the information of one pair, directions that are not observed, in words.
+Leaves    equations to icp_equations and icp_normal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aruco.floor_model import centre_jacobian
+from aruco.icp_match import Matches
+from aruco.icp_normal import scaled_inverse, summed
+from aruco.icp_rows import Layout, Rows
+from aruco.pose_math import Array, Pose, adjoint
+
+# Of a turn or shift in the world, about the camera's centre.
+_AXES = ("x", "y", "z")
+# Share of what was not known beforehand that is still not known: above this, clouds say less than the given pose.
+_LEFT = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PairInformation:
+    """What the clouds of two cameras say about their relative pose, depth errors marginalised under their prior."""
+
+    information: Array  # (6, 6) of a left twist (rotation, translation) of T_target_source, in the target's frame
+    unobservable: tuple[str, ...]  # directions in which it says less than the given poses, in words
+    fitness: float  # both directions together
+    rmse: float  # [m] of the gaps that met
+    n_points: int
+    overlap_m2: float
+
+
+def pair_information(
+    rows: Rows,
+    layout: Layout,
+    n_cells: int,
+    errors: Sequence[Array],
+    pair: tuple[str, str],
+    T_world_cam: Mapping[str, Pose],
+    prior: Array,
+    *,
+    scale: float,
+    biased: bool,
+) -> tuple[Array, tuple[str, ...]]:
+    """Information (6, 6) of T_target_source, and the directions of which there is less than in the prior.
+
+    Args:
+        rows: Of all pairs.
+        layout: Of the unknowns.
+        n_cells: Of all cameras.
+        errors: Of source and target: covariance (4, 4) of depth errors beforehand.
+        pair: Source and target.
+        T_world_cam: In the equations' world.
+        prior: (6, 6) covariance of the given relative pose, as a twist in the equations' world.
+        scale: Factor on noise.
+        biased: Whether depth errors are unknown.
+    """
+    source, target = pair
+    place = layout.cameras.index(source), layout.cameras.index(target)
+    normal = summed(rows.only((rows.a == place[0]) & (rows.b == place[1])), layout, n_cells, scale=scale)
+    at = layout.pose(source)
+    H = normal.H[at, at]
+    if biased:
+        both = np.r_[
+            layout.bias(source).start : layout.bias(source).stop, layout.bias(target).start : layout.bias(target).stop
+        ]
+        known = np.zeros((8, 8))
+        known[:4, :4] = np.linalg.inv(errors[0])
+        known[4:, 4:] = np.linalg.inv(errors[1])
+        C = normal.H[at, both]
+        H = H - C @ np.linalg.solve(normal.H[np.ix_(both, both)] + known, C.T)
+    Ad = adjoint(T_world_cam[target])
+    words = unobserved(prior, scaled_inverse(H + np.linalg.inv(prior)), T_world_cam[source][:3, 3])
+    information = Ad.T @ H @ Ad
+    return (information + information.T) / 2, words
+
+
+def unobserved(before: Array, after: Array, centre: Array) -> tuple[str, ...]:
+    """Turns and shifts of a camera that are hardly better known afterwards, in words.
+
+    Args:
+        before: (6, 6) covariance of a left twist in the world.
+        after: (6, 6) likewise, with the clouds.
+        centre: (3,) of the camera.
+    """
+    J = centre_jacobian(centre)
+    share = np.diag(J @ after @ J.T) / np.maximum(np.diag(J @ before @ J.T), 1e-30)
+    turns = [("yaw" if k == 1 else f"turn about {_AXES[k]}") for k in range(3) if share[k] > _LEFT]
+    shifts = [("height" if k == 1 else f"shift along {_AXES[k]}") for k in range(3) if share[3 + k] > _LEFT]
+    return (*turns, *shifts)
+
+
+def fit_of(there: Matches, back: Matches) -> tuple[float, float, int]:
+    """Fitness and rmse [m] of both directions together, and how many samples of the source met."""
+    met, could = len(there) + len(back), there.n_candidates + back.n_candidates
+    squares = float(there.gap_m @ there.gap_m + back.gap_m @ back.gap_m)
+    return (met / could if could else 0.0), (squares / met) ** 0.5 if met else float("nan"), len(there)

@@ -1,0 +1,409 @@
+"""Which moves of cameras are kept: true ones, and none that wrong depth, a slide or chance asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from floor_rooms import FLOOR, WALLS, Wall, cameras, depth_image
+from icp_rooms import LEVEL, box, camera_data
+
+from aruco.floor_model import centre_jacobian
+from aruco.icp_cloud import N_FOLDS, Cloud, cloud_of
+from aruco.icp_gates import JOINT_SIGMAS, Verdict, judge, set_aside
+from aruco.icp_heldout import Comparison, HeldOut, compared_squares, held_out, patches
+from aruco.icp_match import overlapping_pairs
+from aruco.icp_objections import CHI2_999, surprise
+from aruco.icp_solve import Prior, Registration, register
+from aruco.icp_types import ICPConfig
+from aruco.pose_math import Array, Pose, exp_so3, invert_transform, make_pose, pose_distance
+
+RIG = cameras()
+FULL = ICPConfig(region="full", stride=2)
+# Small boxes at several places and turned sides: something to hold yaw, x and z by.
+STEPS = (
+    FLOOR,
+    *WALLS,
+    *box((-0.9, 0.0, -0.3), (-0.2, 0.8, 0.3)),
+    *box((0.2, 0.0, 0.4), (0.9, 0.5, 1.0)),
+    *box((0.1, 0.0, -1.1), (0.8, 0.9, -0.4)),
+)
+GOOD, ROUGH = (0.03, 2.0), (0.3, 8.0)  # degrees and mm about and along each axis
+Spoil = Callable[[Array], Array]
+
+
+def at_other(T: Pose, turn_deg: Sequence[float] | Array, shift_m: Sequence[float] | Array) -> Pose:
+    """A pose turned about its centre and shifted, in world axes."""
+    return make_pose(exp_so3(np.radians(turn_deg)) @ T[:3, :3], T[:3, 3] + np.asarray(shift_m))
+
+
+def poses_off(size: tuple[float, float], seed: int) -> dict[str, Pose]:
+    rng = np.random.default_rng(seed)
+    return {name: at_other(T, rng.normal(0, size[0], 3), rng.normal(0, 1e-3 * size[1], 3)) for name, T in RIG.items()}
+
+
+def covariance(T: Pose, size: tuple[float, float]) -> Array:
+    J = centre_jacobian(T[:3, 3], inverse=True)
+    return J @ np.diag([np.radians(size[0]) ** 2] * 3 + [(1e-3 * size[1]) ** 2] * 3) @ J.T
+
+
+@cache
+def seen(walls: tuple[Wall, ...] = STEPS) -> dict[str, Cloud]:
+    return {name: cloud_with(name, walls) for name in RIG}
+
+
+def cloud_with(name: str, walls: Sequence[Wall] = STEPS, spoil: Spoil = lambda depth: depth) -> Cloud:
+    depth = spoil(depth_image(RIG[name], walls, seed=int(name[-1])))
+    return cloud_of(name, camera_data(depth), FULL, T_world_cam=RIG[name], floor=LEVEL)
+
+
+def judged(
+    clouds: Mapping[str, Cloud],
+    start: Mapping[str, Pose],
+    size: tuple[float, float] | None,
+    config: ICPConfig = FULL,
+) -> tuple[Registration, Verdict]:
+    """A registration without gates, and what is left of it."""
+    priors = {
+        name: Prior(T_world_cam=T, covariance=None if size is None else covariance(T, size))
+        for name, T in start.items()
+    }
+    pairs = overlapping_pairs(clouds, start, config)
+
+    def again(kept: Collection[str] = (), silent: Collection[str] = ()) -> Registration:
+        some, meeting = set_aside(clouds, pairs, silent)
+        return register(some, start, priors, meeting, config, floor=LEVEL, reference="cam0", kept=kept)
+
+    first = again()
+    return first, judge(first, clouds, start, priors, config, floor=LEVEL, register=again)
+
+
+def errors_mm(T_world_cam: Mapping[str, Pose]) -> dict[str, float]:
+    """Of every camera's place as the reference sees it."""
+    relative = {name: invert_transform(T_world_cam["cam0"]) @ T for name, T in T_world_cam.items()}
+    truth = {name: invert_transform(RIG["cam0"]) @ T for name, T in RIG.items()}
+    return {name: 1e3 * pose_distance(relative[name], truth[name])[1] for name in RIG}
+
+
+def mean_mm(T_world_cam: Mapping[str, Pose]) -> float:
+    return float(np.mean([e for name, e in errors_mm(T_world_cam).items() if name != "cam0"]))
+
+
+@pytest.fixture(scope="module")
+def rough() -> tuple[dict[str, Pose], Registration, Verdict]:
+    start = poses_off(ROUGH, 1)
+    return start, *judged(seen(), start, ROUGH)
+
+
+@pytest.fixture(scope="module")
+def shares(rough: tuple[dict[str, Pose], Registration, Verdict]) -> HeldOut:
+    return held_out(rough[1], seed=0)
+
+
+# ------------------------------------------------------------------------------------------------------- what is kept
+
+
+def test_moves_that_are_right_are_kept(rough: tuple[dict[str, Pose], Registration, Verdict]):
+    start, _, verdict = rough
+    assert all(verdict.moves[name].accepted for name in ("cam1", "cam2", "cam3"))
+    assert (verdict.left_out, verdict.rounds) == ((), 1)
+    # Boxes of 0.7 m in small images tell tilt and height, and a part of yaw, x and z.
+    assert mean_mm(verdict.registration.T_world_cam) < 0.8 * mean_mm(start)
+    for name in ("cam1", "cam2", "cam3"):
+        move = verdict.moves[name]
+        assert move.held_out_after_mm < move.held_out_before_mm
+        assert move.gain_sigmas >= JOINT_SIGMAS
+        assert move.prior_sigmas < np.sqrt(CHI2_999[6])
+        assert "standard errors" in move.reason
+
+
+def test_the_reference_stays_and_says_so(rough: tuple[dict[str, Pose], Registration, Verdict]):
+    start, _, verdict = rough
+    np.testing.assert_array_equal(verdict.registration.T_world_cam["cam0"], start["cam0"])
+    assert not verdict.moves["cam0"].accepted
+    assert "reference" in verdict.moves["cam0"].reason
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_that_are_right_are_left_alone_or_hardly_moved(seed: int):
+    clouds = {
+        name: cloud_of(name, camera_data(depth_image(T, STEPS, seed=10 * seed + k)), FULL, T_world_cam=T, floor=LEVEL)
+        for k, (name, T) in enumerate(RIG.items())
+    }
+    _, verdict = judged(clouds, RIG, GOOD)
+    # A prior of 2 mm that is not needed lets chance in by a part of itself at most.
+    assert max(errors_mm(verdict.registration.T_world_cam).values()) < 1.0
+    for name, move in verdict.moves.items():
+        if not move.accepted:
+            np.testing.assert_array_equal(verdict.registration.T_world_cam[name], RIG[name])
+
+
+def test_nothing_slides_over_a_bare_floor():
+    start = poses_off(GOOD, 2)
+    _, verdict = judged(seen((FLOOR,)), start, GOOD)
+    for name, T in verdict.registration.T_world_cam.items():
+        off = T[:3, 3] - start[name][:3, 3]
+        assert np.hypot(off[0], off[2]) < 1e-3
+        turn = T[:3, :3] @ start[name][:3, :3].T
+        assert abs(np.degrees(np.arctan2(turn[0, 2], turn[2, 2]))) < 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Doubtful:
+    """What was held out of a registration, where it speaks against one camera's move and for all others."""
+
+    registration: Registration
+
+    def gaps(self, kept: Collection[str]) -> frozenset[str]:
+        return frozenset(kept)
+
+    def compared(self, before: frozenset[str], after: frozenset[str]) -> Comparison:
+        sigmas = -3.0 if before - after == {"cam2"} else 5.0
+        return Comparison(gain=sigmas, share=0.5 + sigmas, sigma=1.0, n_patches=9)
+
+    def median_mm(self, camera: str, gaps: frozenset[str]) -> float:
+        return float(len(gaps))
+
+
+def test_a_camera_that_held_out_distances_speak_against_stays_while_others_move(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("aruco.icp_gates.held_out", lambda registration, seed: Doubtful(registration=registration))
+    start = poses_off(ROUGH, 1)
+    _, verdict = judged(seen(), start, ROUGH)
+    np.testing.assert_array_equal(verdict.registration.T_world_cam["cam2"], start["cam2"])
+    assert "grow, by 3.0 standard errors" in verdict.moves["cam2"].reason
+    assert verdict.moves["cam2"].gain_sigmas == -3.0
+    assert verdict.moves["cam1"].accepted
+    assert verdict.moves["cam1"].gain_sigmas == 5.0
+    assert verdict.rounds == 2
+    # It is not set aside: its cloud remains a witness.
+    assert verdict.left_out == ()
+    assert any("cam2" in pair for pair in verdict.registration.pairs)
+
+
+# --------------------------------------------------------------------------------------------------------- wrong depth
+
+
+def scaled(factor: float) -> Spoil:
+    return lambda depth: factor * depth
+
+
+def curved(depth: Array) -> Array:
+    """3 % more half an image's width beside the middle: a lens that was not taken out."""
+    height, width = depth.shape
+    v, u = np.mgrid[0:height, 0:width]
+    return depth * (1 + 0.03 * ((u - width / 2) ** 2 + (v - height / 2) ** 2) / (width / 2) ** 2)
+
+
+@pytest.mark.parametrize("spoil", [scaled(1.05), scaled(0.96)], ids=["5 % long", "4 % short"])
+def test_a_camera_whose_depth_is_wrong_keeps_its_pose_and_takes_nobody_along(spoil: Spoil):
+    start = poses_off(GOOD, 2)
+    _, verdict = judged({**seen(), "cam2": cloud_with("cam2", spoil=spoil)}, start, GOOD)
+    np.testing.assert_array_equal(verdict.registration.T_world_cam["cam2"], start["cam2"])
+    assert verdict.left_out == ("cam2",)
+    assert "depth is wrong" in verdict.moves["cam2"].reason
+    # Nobody is worse off than without that cloud, to the prior's own size of chance.
+    assert mean_mm(verdict.registration.T_world_cam) < mean_mm(start) + 0.5
+
+
+def test_where_no_depth_error_is_estimated_wrong_depth_is_found_by_where_it_puts_cameras():
+    start = poses_off(GOOD, 2)
+    clouds = {**seen(), "cam2": cloud_with("cam2", spoil=scaled(1.05))}
+    naive, verdict = judged(clouds, start, GOOD, replace(FULL, depth_bias=False))
+    # Held-out distances alone would accept it: what was held out of its cloud is as wrong as the rest.
+    assert pose_distance(naive.T_world_cam["cam2"], start["cam2"])[1] > 5e-3
+    assert mean_mm(naive.T_world_cam) > mean_mm(start) + 2.0
+    np.testing.assert_array_equal(verdict.registration.T_world_cam["cam2"], start["cam2"])
+    assert "cam2" in verdict.left_out
+    assert mean_mm(verdict.registration.T_world_cam) < mean_mm(start) + 0.5
+
+
+def test_a_lens_that_was_not_taken_out_does_no_harm():
+    start = poses_off(GOOD, 2)
+    _, verdict = judged({**seen(), "cam2": cloud_with("cam2", spoil=curved)}, start, GOOD)
+    # No error of depth that is believed is curved; what looks like one may pass, but not take a pose away.
+    assert mean_mm(verdict.registration.T_world_cam) < mean_mm(start) + 0.5
+
+
+def test_a_reference_whose_depth_is_wrong_moves_nobody():
+    start = poses_off(GOOD, 2)
+    _, verdict = judged({**seen(), "cam0": cloud_with("cam0", spoil=scaled(1.05))}, start, GOOD)
+    assert verdict.left_out == ("cam0",)
+    for name, T in start.items():
+        np.testing.assert_array_equal(verdict.registration.T_world_cam[name], T)
+    assert "depth is wrong" in verdict.moves["cam0"].reason
+    assert "without the clouds of cam0" in verdict.moves["cam1"].reason
+
+
+def test_a_bias_that_a_camera_may_have_is_no_reason_to_refuse_it():
+    start = poses_off(ROUGH, 1)
+    _, verdict = judged({**seen(), "cam2": cloud_with("cam2", spoil=scaled(1.004))}, start, ROUGH)
+    assert verdict.left_out == ()
+    assert mean_mm(verdict.registration.T_world_cam) < 0.8 * mean_mm(start)
+
+
+# ------------------------------------------------------------------------------------------------- bounds and priors
+
+
+def test_a_move_beyond_the_prior_is_refused_and_one_without_a_prior_is_not():
+    start = poses_off(GOOD, 2)
+    start["cam2"] = at_other(start["cam2"], (1.0, 0.0, 0.4), (0.02, 0.02, -0.02))
+    _, verdict = judged(seen(), start, GOOD)
+    np.testing.assert_array_equal(verdict.registration.T_world_cam["cam2"], start["cam2"])
+    assert "sigma of what its given pose is known to" in verdict.moves["cam2"].reason
+    assert verdict.moves["cam2"].prior_sigmas > np.sqrt(CHI2_999[6])
+    _, free = judged(seen(), start, None)
+    assert free.moves["cam2"].accepted
+    assert np.isnan(free.moves["cam2"].prior_sigmas)
+    assert errors_mm(free.registration.T_world_cam)["cam2"] < 0.9 * errors_mm(start)["cam2"]
+
+
+def test_a_move_beyond_the_bounds_is_refused():
+    start = poses_off(ROUGH, 1)
+    _, verdict = judged(seen(), start, ROUGH, replace(FULL, max_translation_m=0.003))
+    assert not any(move.accepted and move.translation_mm > 3 for move in verdict.moves.values())
+    assert any("that are allowed" in move.reason for move in verdict.moves.values())
+
+
+def test_the_prior_is_asked_about_what_clouds_wish_not_about_what_they_were_granted():
+    prior = np.diag([1.0, 4.0])
+    # Clouds as sure as the prior get half of their wish, which is (6, 0): 4.2 sigma of what it may be by chance.
+    assert surprise(np.array([3.0, 0.0]), prior, 0.5 * prior) == pytest.approx(36 / 2)
+    assert surprise(np.array([3.0, 0.0]), prior, prior) == pytest.approx(9)
+    # What clouds say nothing of does not move; rounding there is no surprise.
+    assert surprise(np.array([3.0, 1e-9]), prior, np.diag([1.0, 0.0])) == pytest.approx(9)
+
+
+def test_wishes_by_chance_surprise_as_chi_square_does():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(6, 6))
+    prior = A @ A.T
+    noise = np.diag(rng.uniform(0.1, 2.0, 6))
+    gain = prior @ np.linalg.inv(prior + noise)
+    truth = rng.multivariate_normal(np.zeros(6), prior, 4000)
+    wish = (truth + rng.multivariate_normal(np.zeros(6), noise, 4000)) @ gain.T
+    chi2 = np.array([surprise(x, prior, gain @ prior) for x in wish])
+    # Six degrees of freedom less what hardly told directions lose; 4000 draws know a mean of 6 to 0.06.
+    assert 5.0 < chi2.mean() < 6.2
+    assert (chi2 > CHI2_999[6]).mean() < 0.003
+
+
+# ------------------------------------------------------------------------------------------------------- held-out part
+
+
+def test_what_is_held_out_is_held_out_of_all_pairs(shares: HeldOut):
+    rows = shares.registration.rows
+    assert set(shares.fold) == set(range(N_FOLDS))
+    for patch in np.unique(shares.patch)[:20]:
+        assert len(set(shares.fold[shares.patch == patch])) == 1
+    # A patch of floor in the middle of the room is seen by several pairs.
+    pairs = rows.a[~rows.is_floor] * 10 + rows.b[~rows.is_floor]
+    patch = shares.patch[~rows.is_floor]
+    assert max(len(set(pairs[patch == k])) for k in np.unique(patch)) >= 3
+    sizes = np.bincount(shares.fold)
+    assert sizes.min() > 0.6 * sizes.max()
+
+
+def test_patches_are_places(shares: HeldOut):
+    rows = shares.registration.rows
+    floor = rows.is_floor
+    p_cross_n, n = rows.by_a[floor, :3], rows.by_a[floor, 3:6]
+    place = np.cross(n, p_cross_n)
+    for patch in np.unique(patches(rows)[floor])[:20]:
+        extent = np.ptp(place[shares.patch[floor] == patch], axis=0)
+        assert extent.max() <= 0.61  # a patch's side, and the tilt of the floor
+
+
+def test_a_solution_does_not_know_what_was_held_out(shares: HeldOut):
+    gaps = shares.gaps()
+    rows = shares.registration.rows
+    # Fitted gaps are smaller than predicted ones, in squares of their sigma.
+    fitted = rows.gaps(shares.registration.solution(), shares.registration.layout)
+    assert np.sum(gaps**2 / rows.variance) > np.sum(fitted**2 / rows.variance)
+
+
+def test_a_comparison_there_and_back_says_the_opposite(shares: HeldOut):
+    new, old = shares.gaps(), shares.gaps(["cam1", "cam2", "cam3"])
+    there, back = shares.compared(old, new), shares.compared(new, old)
+    assert there.gain == pytest.approx(-back.gain, rel=1e-6)
+    assert there.share == pytest.approx(1 - back.share, rel=1e-6)
+    assert there.sigmas == pytest.approx(-back.sigmas, rel=1e-6)
+    assert there.sigmas > JOINT_SIGMAS
+    assert shares.compared(new, new).sigmas == 0
+
+
+def patch_squares(truth: float, rng: np.random.Generator, information: Array) -> Array:
+    """(k, 3) squares by patch of a way of length one, of which the truth is a share."""
+    # Whitened: old gaps are truth * d + noise along a unit direction d of length sqrt(information), new ones less d.
+    noise = rng.normal(size=len(information))
+    d = np.sqrt(information)
+    old, new = truth * d + noise, (truth - 1) * d + noise
+    return np.column_stack([old**2, new**2, old * new])
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_moves_that_are_worth_nothing_pass_as_rarely_as_said(uneven: bool):
+    rng = np.random.default_rng(3)
+    information = 0.3 * (rng.pareto(1.5, 120) if uneven else np.ones(120))
+    # A truth half way is as far from the old as from the new: 2.3 % are above two sigma by chance.
+    sigmas = [compared_squares(patch_squares(0.5, rng, information)).sigmas for _ in range(3000)]
+    assert np.mean(np.array(sigmas) > 2.0) < 0.03
+    # At the old place itself hardly any is.
+    at_old = [compared_squares(patch_squares(0.0, rng, information)).sigmas for _ in range(3000)]
+    assert np.mean(np.array(at_old) > 1.0) < 0.01
+
+
+def test_moves_that_are_right_pass_by_what_they_are_worth():
+    rng = np.random.default_rng(4)
+    # Squares shrink by 24, as six unknowns do of which clouds know four times more than the prior.
+    sigmas = [compared_squares(patch_squares(1.0, rng, np.full(120, 0.2))).sigmas for _ in range(1000)]
+    # Half the way is 0.5 / (1 / sqrt(24)) = 2.45 sigma.
+    assert np.mean(sigmas) == pytest.approx(2.45, abs=0.25)
+    assert np.mean(np.array(sigmas) > 1.0) > 0.85
+
+
+def test_one_patch_alone_proves_nothing():
+    rng = np.random.default_rng(5)
+    information = np.append(np.full(40, 0.01), 100.0)
+    assert abs(compared_squares(patch_squares(1.0, rng, information)).sigmas) < 1.0
+    # The same over many patches does.
+    assert compared_squares(patch_squares(1.0, rng, np.full(41, 2.5))).sigmas > 3.0
+    # And the naive measure takes it: squares shrink by a hundred.
+    squares = patch_squares(1.0, rng, information)
+    assert (squares[:, 0] - squares[:, 1]).sum() > 50
+
+
+def test_errors_that_a_patch_shares_make_it_no_surer():
+    rng = np.random.default_rng(6)
+    passed = 0
+    for _ in range(500):
+        shared = np.repeat(rng.normal(size=30), 10)  # 300 gaps, ten of one error each
+        d = np.full(300, 0.3)
+        old, new = 0.5 * d + shared, -0.5 * d + shared
+        squares = np.column_stack([old**2, new**2, old * new]).reshape(30, 10, 3).sum(axis=1)
+        passed += compared_squares(squares).sigmas > 2.0
+    assert passed / 500 < 0.05
+    naive = 0.0
+    for _ in range(500):
+        shared = np.repeat(rng.normal(size=30), 10)
+        gain = 2 * 0.3 * shared  # of each gap, whose variance is said to be one
+        naive += gain.sum() > 2.0 * 2 * 0.3 * np.sqrt(300)
+    # Counting each gap by itself takes chance for proof in a quarter of all cases.
+    assert naive / 500 > 0.2
+
+
+def test_clouds_set_aside_have_no_say():
+    clouds, pairs = set_aside(seen(), {("cam0", "cam1"): 1.0, ("cam1", "cam2"): 2.0}, ("cam2",))
+    assert pairs == {("cam0", "cam1"): 1.0}
+    assert not clouds["cam2"].is_floor.any()
+    assert clouds["cam1"] is seen()["cam1"]
+
+
+def test_the_verdict_is_the_same_each_time(rough: tuple[dict[str, Pose], Registration, Verdict]):
+    start, _, verdict = rough
+    _, again = judged(seen(), start, ROUGH)
+    assert {k: m.reason for k, m in again.moves.items()} == {k: m.reason for k, m in verdict.moves.items()}
+    for name, T in verdict.registration.T_world_cam.items():
+        np.testing.assert_array_equal(again.registration.T_world_cam[name], T)

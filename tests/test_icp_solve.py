@@ -1,0 +1,366 @@
+"""Clouds brought together: what moves, what stays, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from floor_rooms import BASELINE_M, FLOOR, WALLS, Wall, cameras, depth_image, zoomed
+from icp_rooms import LEVEL, box
+
+from aruco.floor_model import centre_jacobian
+from aruco.floor_plane import FloorPlane
+from aruco.icp_cloud import Cloud, cloud_of
+from aruco.icp_equations import State, floor_parameters, floor_rows, joined, pair_rows
+from aruco.icp_match import Matches, match, overlapping_pairs
+from aruco.icp_normal import summed
+from aruco.icp_rows import Layout, Rows
+from aruco.icp_smooth import smoothed
+from aruco.icp_solve import Prior, Registration, register
+from aruco.icp_types import ICPConfig
+from aruco.pose_math import Array, Pose, adjoint, exp_so3, invert_transform, log_so3, make_pose, pose_distance
+
+RIG = cameras()
+ZOOM = 2  # 640 x 360: cells of 28 px are a few centimetres
+FULL = ICPConfig(region="full", stride=4)
+NAMES = tuple(RIG)
+# Boxes at several places that several cameras see the same sides of: something to hold yaw, x and z by.
+STEPS = (
+    FLOOR,
+    *WALLS,
+    *box((-0.9, 0.0, -0.3), (-0.2, 0.8, 0.3)),
+    *box((0.2, 0.0, 0.4), (0.9, 0.5, 1.0)),
+    *box((0.1, 0.0, -1.1), (0.8, 0.9, -0.4)),
+)
+GOOD, ROUGH = (0.03, 2.0), (0.3, 8.0)  # degrees and mm about and along each axis
+
+
+def off(size: tuple[float, float], seed: int) -> dict[str, Pose]:
+    rng = np.random.default_rng(seed)
+    return {
+        name: make_pose(
+            exp_so3(np.radians(rng.normal(0, size[0], 3))) @ T[:3, :3], T[:3, 3] + rng.normal(0, 1e-3 * size[1], 3)
+        )
+        for name, T in RIG.items()
+    }
+
+
+def covariance(T: Pose, size: tuple[float, float]) -> Array:
+    J = centre_jacobian(T[:3, 3], inverse=True)
+    return J @ np.diag([np.radians(size[0]) ** 2] * 3 + [(1e-3 * size[1]) ** 2] * 3) @ J.T
+
+
+def data_of(name: str, walls: Sequence[Wall], disparity_px: float = 0.0) -> dict[str, Any]:
+    depth = depth_image(RIG[name], walls, seed=NAMES.index(name), disparity_px=disparity_px, zoom=ZOOM)
+    return {"depth": depth, "K": zoomed(ZOOM), "baseline": BASELINE_M / ZOOM, "n_frames": 20}
+
+
+@cache
+def seen(walls: tuple[Wall, ...] = STEPS, disparity_px: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> dict[str, Cloud]:
+    return {
+        name: cloud_of(name, data_of(name, walls, disparity_px[k]), FULL, T_world_cam=T, floor=LEVEL)
+        for k, (name, T) in enumerate(RIG.items())
+    }
+
+
+def registered(
+    clouds: Mapping[str, Cloud],
+    start: Mapping[str, Pose],
+    size: tuple[float, float] | None,
+    *,
+    kept: Sequence[str] = (),
+    config: ICPConfig = FULL,
+) -> Registration:
+    priors = {
+        name: Prior(T_world_cam=start[name], covariance=None if size is None else covariance(start[name], size))
+        for name in clouds
+    }
+    pairs = overlapping_pairs(clouds, start, config)
+    return register(clouds, start, priors, pairs, config, floor=LEVEL, reference="cam0", kept=kept)
+
+
+def errors_mm(T_world_cam: Mapping[str, Pose]) -> dict[str, float]:
+    """Of every camera's place as the reference sees it."""
+    out = {}
+    for name in set(T_world_cam) - {"cam0"}:
+        T, T_true = (invert_transform(poses["cam0"]) @ poses[name] for poses in (T_world_cam, RIG))
+        out[name] = 1e3 * pose_distance(T, T_true)[1]
+    return out
+
+
+def mean_mm(T_world_cam: Mapping[str, Pose]) -> float:
+    return float(np.mean(list(errors_mm(T_world_cam).values())))
+
+
+@pytest.fixture(scope="module")
+def rough() -> Registration:
+    return registered(seen(), off(ROUGH, 1), ROUGH)
+
+
+# ------------------------------------------------------------------------------------------------------ where it ends
+
+
+@pytest.mark.parametrize("method", ["point_to_plane", "gicp"])
+def test_clouds_of_a_furnished_room_correct_rough_poses(method: str):
+    config = replace(FULL, method=method)
+    start = off(ROUGH, 1)
+    found = registered(seen(), start, ROUGH, config=config)
+    assert found.settled
+    promised = np.mean([found.pair_sigma_mm("cam0", name) for name in NAMES[1:]])
+    # Noise is promised 0.06 px that neighbours share, so a part of the given poses stays that the data could mend.
+    assert mean_mm(found.T_world_cam) < promised < 0.6 * mean_mm(start)
+
+
+def test_good_poses_stay_good():
+    start = off(GOOD, 2)
+    found = registered(seen(), start, GOOD)
+    assert mean_mm(found.T_world_cam) < mean_mm(start)
+
+
+def test_the_reference_and_kept_cameras_stay_to_the_last_bit():
+    start = off(ROUGH, 1)
+    found = registered(seen(), start, ROUGH, kept=["cam2"])
+    for name in ("cam0", "cam2"):
+        np.testing.assert_array_equal(found.T_world_cam[name], start[name])
+    assert found.kept == ("cam2",)
+    # As good as anything can be beside a reference and a camera that are wrong by themselves.
+    assert not np.array_equal(found.T_world_cam["cam1"], start["cam1"])
+
+
+def test_the_same_clouds_give_the_same_bytes(rough: Registration):
+    again = registered(seen(), off(ROUGH, 1), ROUGH)
+    for name, T in rough.T_world_cam.items():
+        assert T.tobytes() == again.T_world_cam[name].tobytes()
+    assert rough.joint.tobytes() == again.joint.tobytes()
+
+
+def test_a_world_that_points_down_gives_the_same_rig(rough: Registration):
+    flip = make_pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    config = replace(FULL, up=(0.0, -1.0, 0.0))
+    start = {name: flip @ T for name, T in off(ROUGH, 1).items()}
+    Ad = adjoint(flip)
+    priors = {
+        name: Prior(T_world_cam=T, covariance=Ad @ covariance(flip @ T, ROUGH) @ Ad.T) for name, T in start.items()
+    }
+    floor = FloorPlane(np.array([0.0, -1.0, 0.0]), 0.0)
+    pairs = overlapping_pairs(seen(), start, config)
+    found = register(seen(), start, priors, pairs, config, floor=floor, reference="cam0")
+    for name, T in rough.T_world_cam.items():
+        # Sums in another order, and a stop at a tenth of a sigma.
+        np.testing.assert_allclose(flip @ found.T_world_cam[name], T, atol=1e-6)
+
+
+def test_a_camera_without_overlap_is_kept():
+    start = off(ROUGH, 1)
+    pairs = [pair for pair in overlapping_pairs(seen(), start, FULL) if "cam3" not in pair]
+    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, ROUGH)) for name, T in start.items()}
+    found = register(seen(), start, priors, pairs, FULL, floor=LEVEL, reference="cam0")
+    assert found.kept == ("cam3",)
+    np.testing.assert_array_equal(found.T_world_cam["cam3"], start["cam3"])
+
+
+def test_without_floor_or_pairs_poses_stay():
+    start = off(ROUGH, 1)
+    priors = {name: Prior(T_world_cam=T) for name, T in start.items()}
+    found = register(seen(), start, priors, [], FULL, floor=None, reference="cam0")
+    assert set(found.kept) == set(RIG) - {"cam0"}
+    assert found.floor is None
+    for name, T in start.items():
+        np.testing.assert_array_equal(found.T_world_cam[name], T)
+
+
+# -------------------------------------------------------------------------------------------------------- bare floors
+
+
+@pytest.mark.parametrize("size", [GOOD, ROUGH, None])
+def test_nothing_slides_over_a_bare_floor_and_it_is_said(size: tuple[float, float] | None):
+    # Levelled poses: tilt and height are right, yaw, x and z are not.
+    rng = np.random.default_rng(4)
+    turn_deg, shift_mm = size or ROUGH
+    start = {
+        name: make_pose(
+            exp_so3(np.radians([0.0, rng.normal(0, turn_deg), 0.0])) @ T[:3, :3],
+            T[:3, 3] + 1e-3 * shift_mm * rng.normal(size=3) * [1, 0, 1],
+        )
+        for name, T in RIG.items()
+    }
+    found = registered(seen((FLOOR,)), start, size)
+    assert found.pairs
+    for name, T in found.T_world_cam.items():
+        shift = T[:3, 3] - start[name][:3, 3]
+        # The limits of the issue.
+        assert np.hypot(shift[0], shift[2]) < 1e-3
+        assert abs(np.degrees(log_so3(T[:3, :3] @ start[name][:3, :3].T)[1])) < 0.02
+    for words in (*(found.unobservable[name] for name in ("cam1", "cam2", "cam3")), *unobserved_pairs(found)):
+        assert {"yaw", "shift along x", "shift along z"} <= set(words)
+
+
+def unobserved_pairs(found: Registration) -> list[tuple[str, ...]]:
+    return [pair.unobservable for pair in found.pairs.values()]
+
+
+def test_information_of_a_bare_floor_knows_tilt_and_height_alone():
+    found = registered(seen((FLOOR,)), RIG, ROUGH)
+    for (_, target), pair in found.pairs.items():
+        back = adjoint(invert_transform(RIG[target]))
+        # In the world's axes, about the world's origin, on the floor: yaw, x and z leave the floor as it is.
+        information = back.T @ pair.information @ back
+        assert np.diag(information)[[1, 3, 5]].max() < 1e-6 * information[4, 4]
+
+
+# -------------------------------------------------------------------------------------------------------- depth errors
+
+
+def test_depth_errors_are_estimated_with_the_poses():
+    px = (0.0, 0.25, 0.0, -0.2)
+    start = off(GOOD, 2)
+    found = registered(seen(STEPS, px), start, GOOD)
+    for k, name in enumerate(RIG):
+        # 1 / z_true = 1 / z - d / (f B), with f B = 84 px m.
+        error = found.bias[name][1] - px[k] / 84.0
+        assert abs(error) < 3.0 * np.sqrt(found.bias_covariance[name][1, 1])
+    # They are told from none.
+    assert found.bias["cam1"][1] > 2.0 * np.sqrt(found.bias_covariance["cam1"][1, 1])
+    assert mean_mm(found.T_world_cam) < mean_mm(start)
+    plain = registered(seen(STEPS, px), start, GOOD, config=replace(FULL, depth_bias=False))
+    assert not any(b.any() for b in plain.bias.values())
+    assert mean_mm(plain.T_world_cam) > mean_mm(found.T_world_cam)
+
+
+def test_evidence_tells_rigs_with_depth_errors_from_those_without():
+    px = (0.3, -0.25, 0.2, -0.3)
+    assert registered(seen(), RIG, GOOD).bias_scale < 0.6 < registered(seen(STEPS, px), RIG, GOOD).bias_scale
+
+
+def test_evidence_tells_rough_poses_from_good_ones():
+    good, rough = (registered(seen(), off(size, 3), None).prior_scale["cam1"] for size in (GOOD, ROUGH))
+    # The default is 0.3 degrees and 6 mm.
+    assert good < 0.5 < 0.7 < rough < 2.5
+
+
+def test_noise_in_slopes_would_shrink_clouds():
+    """Scale and height by one camera's floor, with derivatives at noisy samples and at the surface they lie on."""
+    rng = np.random.default_rng(0)
+    cloud = seen((FLOOR,))["cam0"]
+    z = 1.0 / (1.0 / smoothed(cloud)[1] + rng.normal(0.0, 0.06 / 84.0, len(cloud)))
+    noisy = replace(
+        cloud,
+        depth_m=z,
+        slopes=np.stack([-z, z**2, *(z**2 * cloud.rays[:, :2].T)]),
+        sigma_m=0.06 / 84.0 * z**2,
+        cell=np.arange(len(z)),  # every sample has an error of its own
+    )
+    layout, state = Layout(("cam0",)), standing({"cam0": RIG["cam0"]})
+    prior = np.diag(
+        np.append(np.full(6, 1e2**2), [3e-3**-2, 1.8e-3**-2, 0.6e-3**-2, 0.6e-3**-2, 1e4**2, 1e4**2, 1e4**2])
+    )
+    surprises = []
+    for taken, depth in ((noisy, z), smoothed(noisy)):
+        rows, n_cells = joined(
+            [floor_rows(state, {"cam0": taken}, {"cam0": depth}, layout, "cam0")], {"cam0": taken}, layout
+        )
+        normal = summed(rows, layout, n_cells)
+        P = np.linalg.inv(normal.H + prior)
+        x = -P @ normal.g
+        at = layout.bias("cam0")
+        surprises.append(float(x[at] @ np.linalg.solve(P[at, at], x[at])))
+    # The truth is that nothing is wrong: chi-square of 4 at most, for known noise is no error of depth.
+    assert surprises[1] < 4.0
+    assert surprises[0] > 20.0
+
+
+# ---------------------------------------------------------------------------------------------------------- equations
+
+
+def standing(T_world_cam: Mapping[str, Pose]) -> State:
+    up = np.array([0.0, 1.0, 0.0])
+    return State(
+        T_world_cam=dict(T_world_cam),
+        bias={name: np.zeros(4) for name in T_world_cam},
+        floor=floor_parameters(LEVEL, up),
+        up=up,
+    )
+
+
+Two = tuple[dict[str, Cloud], dict[str, Array], Layout, tuple[Matches, Matches]]
+
+
+@pytest.fixture(scope="module")
+def two() -> Two:
+    about = {name: smoothed(seen()[name]) for name in ("cam0", "cam1")}
+    clouds = {name: cloud for name, (cloud, _) in about.items()}
+    surfaces = {name: depth for name, (_, depth) in about.items()}
+    T = invert_transform(RIG["cam1"]) @ RIG["cam0"]
+    there = match(clouds["cam0"], clouds["cam1"], T, 0.05)
+    back = match(clouds["cam1"], clouds["cam0"], invert_transform(T), 0.05)
+    return clouds, surfaces, Layout(("cam0", "cam1")), (there, back)
+
+
+def test_gaps_follow_every_unknown_as_their_derivatives_say(two: Two):
+    clouds, _, layout, (there, back) = two
+    # Levers are taken on the surface; here everything is, so that differences of gaps are the derivative itself.
+    surfaces = {name: cloud.depth_m for name, cloud in clouds.items()}
+
+    def rows(state: State) -> Rows:
+        now = state.corrected(clouds)
+        pair = pair_rows(state, now, surfaces, layout, there, back, both_normals=False)
+        floors = [floor_rows(state, now, surfaces, layout, name) for name in layout.cameras]
+        return joined([pair, *floors], clouds, layout)[0]
+
+    state = standing({name: RIG[name] for name in layout.cameras})
+    here = rows(state)
+    for k in range(layout.size):
+        x = np.zeros(layout.size)
+        x[k] = 1e-6
+        measured = (rows(state.moved(x, layout)).gap_m - here.gap_m) / 1e-6
+        told = (here.gaps(x, layout) - here.gap_m) / 1e-6
+        # Second order, 1e-6 times metres; slopes of the floor turn its normal by their square only.
+        np.testing.assert_allclose(measured, told, atol=2e-5)
+
+
+def test_what_both_directions_see_counts_once(two: Two):
+    clouds, surfaces, layout, (there, back) = two
+    state = standing({name: RIG[name] for name in layout.cameras})
+    none = np.zeros(0, dtype=np.intp)
+    at = layout.pose("cam1")
+
+    def information(there: Matches, back: Matches) -> Array:
+        rows = pair_rows(state, clouds, surfaces, layout, there, back, both_normals=False)
+        rows, n_cells = joined([rows], clouds, layout)
+        return summed(rows, layout, n_cells).H[at, at]
+
+    one = information(there, replace(back, i=none, j=none, gap_m=np.zeros(0)))
+    both = information(there, back)
+    twice = information(
+        replace(there, i=np.tile(there.i, 2), j=np.tile(there.j, 2), gap_m=np.tile(there.gap_m, 2)), back
+    )
+    # The other direction reaches some cells more; nothing is worth two.
+    assert 1.0 <= np.trace(both) / np.trace(one) < 1.4
+    assert np.trace(twice) / np.trace(both) < 1.05
+
+
+def test_moving_back_to_the_start_is_what_keeping_all_cameras_is(rough: Registration):
+    x = rough.solution(kept=("cam1", "cam2", "cam3"))
+    state = standing({name: invert_transform(rough.T_out_own) @ T for name, T in rough.T_world_cam.items()})
+    moved, start = state.moved(x, rough.layout).T_world_cam, off(ROUGH, 1)
+    for name in ("cam1", "cam2", "cam3"):
+        kept, true = (invert_transform(T["cam0"]) @ T[name] for T in (moved, start))
+        # Linear: products of two turns of 0.3 degrees, over 4 m.
+        np.testing.assert_allclose(kept, true, atol=3e-4)
+
+
+def test_covariances_are_symmetric_and_positive(rough: Registration):
+    for S in (
+        *rough.covariance.values(),
+        *rough.bias_covariance.values(),
+        rough.joint[~rough.frozen][:, ~rough.frozen],
+    ):
+        np.testing.assert_allclose(S, S.T, atol=1e-15)
+        assert np.linalg.eigvalsh(S).min() > 0
+    # The reference is known as it was given.
+    np.testing.assert_allclose(rough.covariance["cam0"], covariance(off(ROUGH, 1)["cam0"], ROUGH), rtol=0.01, atol=1e-7)
+    assert rough.pair_sigma_mm("cam1", "cam2") == pytest.approx(rough.pair_sigma_mm("cam2", "cam1"), rel=0.3)
