@@ -112,7 +112,7 @@ def _evidence(
 ) -> Array:
     """Logarithm (k,) of the marginal likelihood for factors (k, len(names)), up to a constant."""
     H, g = M.T @ clouds.H @ M, M.T @ clouds.g
-    for name in parts.keys() - set(names):
+    for name in sorted(parts.keys() - set(names)):
         part = parts[name].normal
         H, g = H + M.T @ part.H @ M / now[name] ** 2, g + M.T @ part.g / now[name] ** 2
     W = grid**-2.0

@@ -28,6 +28,8 @@ _BOX_QUANTILES = (0.01, 0.99)
 # Whether clouds meet at all shows in every so many samples, of which at least so many must: 160 in all, three cells.
 _EVERY = 8
 _LEAST_MATCHES = 20
+# Of small clouds every sample is asked.
+_FEW = 4000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,6 +154,7 @@ def overlapping_pairs(
 def _meet(a: Cloud, b: Cloud, T_b_a: Pose, config: ICPConfig) -> bool:
     """Whether some samples meet at the coarsest scale."""
     reach = 4 * config.voxel_size * config.max_correspondence_distance_factor
-    there = match(a, b, T_b_a, reach, every=_EVERY)
-    back = match(b, a, invert_transform(T_b_a), reach, every=_EVERY)
+    every = _EVERY if min(len(a), len(b)) > _FEW else 1
+    there = match(a, b, T_b_a, reach, every=every)
+    back = match(b, a, invert_transform(T_b_a), reach, every=every)
     return len(there) + len(back) >= _LEAST_MATCHES

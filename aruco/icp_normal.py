@@ -61,19 +61,20 @@ def summed(rows: Rows, layout: Layout, n_cells: int, *, scale: float = 1.0) -> N
         columns = np.concatenate([k + np.arange(PER_CAMERA) for k in (first_a[at[0]], first_b[at[0]])])
         J = np.hstack([rows.by_a[at], rows.by_b[at]])
         WJ = J * W[at, None]
-        H[np.ix_(columns, columns)] += J.T @ WJ
-        g[columns] += WJ.T @ rows.gap_m[at]
+        # einsum adds up in one order, BLAS in another for each number of threads.
+        H[np.ix_(columns, columns)] += np.einsum("mi,mj->ij", J, WJ)
+        g[columns] += np.einsum("mi,m->i", WJ, rows.gap_m[at])
         mixed[:, columns] += weighted[:, at] @ J
     gap = weighted @ rows.gap_m
-    chi2 = float(W @ rows.gap_m**2)
+    chi2 = float(np.sum(W * rows.gap_m**2))
     if len(m):
         factor = splu(
             (eye_array(n_cells) + weighted @ shared).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
         )
         solved = factor.solve(np.column_stack([mixed, gap]))
-        H -= mixed.T @ solved[:, :-1]
-        g -= mixed.T @ solved[:, -1]
-        chi2 -= float(gap @ solved[:, -1])
+        H -= np.einsum("mi,mj->ij", mixed, solved[:, :-1])
+        g -= np.einsum("mi,m->i", mixed, solved[:, -1])
+        chi2 -= float(np.sum(gap * solved[:, -1]))
     H, g = H[:size, :size] / scale**2, g[:size] / scale**2
     return Normal(H=(H + H.T) / 2, g=g, chi2=chi2 / scale**2)
 

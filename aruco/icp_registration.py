@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from loguru import logger
+from threadpoolctl import threadpool_limits
 
 from aruco.depth_bias import DepthBias
 from aruco.errors import InputError
@@ -92,15 +93,30 @@ def refine_with_icp(
         camera_data=camera_data,
         poses=poses,
         floor_planes=floor_planes,
-        priors={name: Prior(T_world_cam=T, covariance=(covariances or {}).get(name)) for name, T in known.items()},
+        priors={
+            name: Prior(T_world_cam=T, covariance=_checked_covariance(name, (covariances or {}).get(name)))
+            for name, T in known.items()
+        },
         biases=biases or {},
         config=config,
     )
-    if not config.global_init:
-        return _brought_together(asked, {})
-    floor = _common_floor(floor_planes, poses)
-    found = found_elsewhere(camera_data, poses, floor, asked.biases, config)
-    return believed(poses, found, lambda elsewhere: _brought_together(asked, elsewhere))
+    with _one_thread():
+        if not config.global_init:
+            return _brought_together(asked, {})
+        floor = _common_floor(floor_planes, poses)
+        found = found_elsewhere(camera_data, poses, floor, asked.biases, config)
+        return believed(poses, found, lambda elsewhere: _brought_together(asked, elsewhere))
+
+
+def _one_thread() -> threadpool_limits:
+    """Sums of several threads differ in their last bits from those of one.
+
+    Only libraries that are loaded can be told; those that scipy brings are loaded late everywhere else.
+    """
+    import scipy.linalg
+    import scipy.sparse.linalg  # noqa: F401
+
+    return threadpool_limits(1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -172,6 +188,19 @@ def _checked_rigid(name: str, T: Any) -> Pose:
         raise InputError(f"{error}; repair its pose or leave the camera out.") from None
 
 
+def _checked_covariance(name: str, given: Any) -> Array | None:
+    if given is None:
+        return None
+    S = np.asarray(given, dtype=np.float64)
+    if S.shape != (6, 6) or not np.isfinite(S).all() or not np.allclose(S, S.T, rtol=1e-6, atol=1e-12):
+        raise InputError(
+            f"camera {name}: its covariance is no symmetric matrix (6, 6) of finite numbers; leave it out."
+        )
+    if np.linalg.eigvalsh((S + S.T) / 2)[0] < -1e-9 * np.trace(S):
+        raise InputError(f"camera {name}: its covariance has a negative variance in some direction; leave it out.")
+    return (S + S.T) / 2
+
+
 def _common_floor(floor_planes: Mapping[str, FloorPlane], poses: Mapping[str, Pose]) -> FloorPlane | None:
     """The floor amid the planes that cameras see, beneath the middle of the rig; None if nobody sees one."""
     planes = [floor_planes[name] for name in sorted(floor_planes)]
@@ -227,7 +256,8 @@ def _refined(given: _Given, part: tuple[str, ...], pairs: Mapping[Pair, float]) 
     good = {p: area for p, area in within.items() if everything.pairs[p].fitness >= given.config.min_fitness}
 
     def again(kept: Collection[str], silent: Collection[str] = ()) -> Registration:
-        scales = everything.scales if kept else None
+        # A cloud that is set aside may have been why errors were thought to be large.
+        scales = everything.scales if kept and not silent else None
         return _registered(given, *set_aside(clouds, good, silent), kept, scales)
 
     first = everything if len(good) == len(within) else again(())
@@ -313,7 +343,8 @@ def _answered(
         cameras |= part.verdict.moves
         covariances |= part.result.covariance
         if given.config.depth_bias:
-            biases |= {name: _bias(given.clouds[name], part.result, name) for name in part.cameras}
+            heard = {name for pair in part.result.pairs for name in pair} - {*part.verdict.left_out}
+            biases |= {name: _bias(given.clouds[name], part.result, name) for name in sorted(heard)}
     results = {pair: result for part in parts for pair, result in part.pairs.items()}
     # The group of the reference camera; where that overlaps nobody, the largest.
     main = max(parts, key=lambda part: (metrics.reference_camera in part.cameras, len(part.cameras)))
@@ -368,11 +399,9 @@ def _message(metrics: ICPMetrics) -> str:
         return f"{meet} well enough to be used; every camera keeps its pose."
     moved = [metrics.cameras[name] for name in metrics.moved]
     if not moved:
-        return (
-            f"{meet}; every camera keeps its pose, as no move would make clouds meet better where they were not fitted."
-        )
+        return f"{meet}; every camera keeps its pose, each for the reason told of it."
     turn, shift = max(move.rotation_deg for move in moved), max(move.translation_mm for move in moved)
-    return f"{meet}; {len(moved)} of {n} cameras were moved, by up to {turn:.2f} degrees and {shift:.1f} mm."
+    return f"{meet}; {len(moved)} of {n} cameras moved, by up to {turn:.2f} degrees and {shift:.1f} mm."
 
 
 def _why_not(poses: Mapping[str, Pose], clouds: Mapping[str, Cloud], left_out: Mapping[str, str]) -> str:

@@ -6,7 +6,7 @@ Leaves    levelling to aruco.ground_plane.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from aruco.depth_bias import DepthBias
 from aruco.floor_model import centre_jacobian
 from aruco.ground_plane import GroundPlaneConfig, GroundPlaneMetrics, refine_ground_from_depth
+from aruco.model import Camera
 from aruco.pose_math import Array, Pose, exp_so3, make_pose, transform_points
 from rigcal.quality.truth import pair_errors
 from rigcal.sim import Simulation, simulate
@@ -53,16 +54,26 @@ def depth_rig(seed: int, *, biased: bool) -> DepthRig:
     """A simulated rig's depth, pooled over ten frames, without rendering any picture."""
     with_bias, without, exact = _simulated(seed)
     simulation = with_bias if biased else without
-    noise = simulation.rig.depth_noise
-    pooled = replace(noise, sigma_px=noise.sigma_px / N_POOLED**0.5)
-    data: dict[str, dict[str, Any]] = {}
-    for k, camera in enumerate(simulation.recording.cameras):
-        bias = simulation.depth_bias[camera.name]
-        depth = _measured(exact[camera.name], pooled, bias, focal_baseline(camera), seed, k)
-        K = camera.K_depth
-        data[camera.name] = {"depth": depth, "K": K, "baseline": camera.baseline_m, "n_frames": N_POOLED}
+    data = measured_data(simulation.recording.cameras, exact, simulation.depth_bias, simulation.rig.depth_noise, seed)
     place = transform_points(simulation.T_world_target[0], simulation.target.centre_m)
     return DepthRig(T_world_cam=simulation.T_world_cam, camera_data=data, bias=simulation.depth_bias, target_m=place)
+
+
+def measured_data(
+    cameras: Sequence[Camera],
+    exact: Mapping[str, Any],
+    bias: Mapping[str, SimulatedBias],
+    noise: DepthNoise,
+    seed: int,
+) -> dict[str, dict[str, Any]]:
+    """What cameras measure of exact depth (h, w) by name, pooled over ten frames, as ground_plane takes it."""
+    pooled = replace(noise, sigma_px=noise.sigma_px / N_POOLED**0.5)
+    data: dict[str, dict[str, Any]] = {}
+    for k, camera in enumerate(cameras):
+        depth = _measured(exact[camera.name], pooled, bias[camera.name], focal_baseline(camera), seed, k)
+        K = camera.K_depth
+        data[camera.name] = {"depth": depth, "K": K, "baseline": camera.baseline_m, "n_frames": N_POOLED}
+    return data
 
 
 def _room(simulation: Simulation) -> list[Panel]:
@@ -144,12 +155,13 @@ def levelled(
     return Levelled(
         tilts_deg=np.degrees(np.arcsin(tilts)),
         heights_mm=1e3 * np.array(heights),
-        pair_before_mm=_median_mm(T_world_cam, truth),
-        pair_after_mm=_median_mm(new, truth),
+        pair_before_mm=median_mm(T_world_cam, truth),
+        pair_after_mm=median_mm(new, truth),
         T_world_cam=new,
         metrics=metrics,
     )
 
 
-def _median_mm(T_world_cam: Mapping[str, Pose], truth: Mapping[str, Pose]) -> float:
+def median_mm(T_world_cam: Mapping[str, Pose], truth: Mapping[str, Pose]) -> float:
+    """Median error of the relative poses of all pairs of cameras [mm]."""
     return 1e3 * float(np.median([distance for _, distance in pair_errors(T_world_cam, truth).values()]))

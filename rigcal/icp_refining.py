@@ -13,7 +13,6 @@ import numpy as np
 from loguru import logger
 
 from aruco.errors import RigError
-from aruco.floor_model import default_pose_covariance
 from aruco.icp_types import ICPConfig, ICPMetrics
 from aruco.pose_math import Array, Pose
 from aruco.uncertainty import carried
@@ -78,16 +77,14 @@ def _registered(levelling: Levelling, config: ICPConfig) -> tuple[dict[str, Pose
 def _known(levelling: Levelling) -> Mapping[str, Array]:
     """(6, 6) of the marker poses in the levelled world, left perturbation in its axes, without what the floor knows.
 
-    The floor takes part in the registration and would count twice; so levelling tells only how much worse than they
-    say, or than usual, poses are. Of cameras whose file says nothing and that see no floor, nothing is known.
+    The floor takes part in the registration and would count twice; so levelling tells only how much worse poses are
+    than they say. Where the file says nothing the clouds tell: floors that agree say nothing of yaw, x and z.
     """
     metrics, given = levelling.metrics, levelling.given.covariance
     known: dict[str, Array] = {}
-    for name, T in levelling.T_before_cam.items():
+    for name in levelling.T_before_cam:
         scale = metrics.pose_scales.get(name)
         if name in given:
             at_least = max(1.0, 1.0 if scale is None else scale)
             known[name] = at_least**2 * carried(np.asarray(given[name]), metrics.T_level_world)
-        elif scale is not None:
-            known[name] = scale**2 * default_pose_covariance(T)
     return known

@@ -151,6 +151,16 @@ def test_nothing_slides_over_a_bare_floor():
         assert abs(np.degrees(np.arctan2(turn[0, 2], turn[2, 2]))) < 0.02
 
 
+def test_others_follow_a_reference_that_is_not_level():
+    # It does not move, so the floor of all tilts as it does: by 0.6 degrees, of which nobody else is to blame.
+    start = {**RIG, "cam0": at_other(RIG["cam0"], (0.5, 0.0, 0.4), (0.0, 0.005, 0.0))}
+    _, verdict = judged(seen(), start, (0.4, 8.0))
+    assert verdict.left_out == ()
+    assert all(verdict.moves[name].accepted for name in ("cam1", "cam2", "cam3"))
+    # A turn by 0.6 degrees is 25 to 45 mm of each camera seen from the reference.
+    assert mean_mm(verdict.registration.T_world_cam) < 0.5 * mean_mm(start)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Doubtful:
     """What was held out of a registration, where it speaks against one camera's move and for all others."""
