@@ -33,9 +33,11 @@ PARTIAL = 3  # exit code: written, but not every camera was levelled on a floor 
 @click.option("--plot-output", type=click.Path(path_type=Path), metavar="FILE.html",
               help="Where the page goes. Default: beside the output, named after it.")  # fmt: skip
 @click.option("--max-rotation-deg", type=Finite(0, 90, min_open=True), default=5.0, show_default=True, metavar="DEG",
-              help="How far one camera may be turned against the others, by --icp too; more is refused.")  # fmt: skip
+              help="How far one camera may be turned, by --icp too; more is refused. What all others do in common "
+                   "does not count.")  # fmt: skip
 @click.option("--max-translation-m", type=Finite(0, 10, min_open=True), default=0.1, show_default=True, metavar="M",
-              help="How far one camera may be raised or lowered against the others, and by --icp moved.")  # fmt: skip
+              help="How far one camera may be raised or lowered, and by --icp moved, against what all others do in "
+                   "common.")  # fmt: skip
 @click.option("--ransac-threshold", type=Finite(0, 1, min_open=True), metavar="M",
               help="How near a plane depth must be to be part of it. Default: by the noise of depth.")  # fmt: skip
 @click.option("--height-range", type=Finite(-1000, 1000), nargs=2, metavar="MIN MAX",
@@ -98,6 +100,7 @@ def _run(given: dict[str, Any]) -> Levelling:
 
 
 def _tell(levelling: Levelling, written: list[Path]) -> None:
+    from rigcal.icp_refining import log_registration
     from rigcal.report.floor_table import show_levelling
     from rigcal.report.icp_table import remarks_of, sheets_of, show_registration
     from rigcal.report.terminal import console
@@ -106,8 +109,9 @@ def _tell(levelling: Levelling, written: list[Path]) -> None:
     show_levelling(out, levelling.figures, levelling.facts)
     found = levelling.registration
     if found is not None:
-        sheets = sheets_of(found.metrics, levelling.T_world_cam.keys(), found.given_bias)
-        show_registration(out, sheets, remarks_of(found.metrics), found.fact)
+        sheets = sheets_of(found.metrics, levelling.T_world_cam.keys(), found.given_bias, found.new_bias.keys())
+        show_registration(out, sheets, remarks_of(found.metrics))
+        log_registration(found)
     for path in written:
         out.print(f"Wrote {path}", markup=False)
 

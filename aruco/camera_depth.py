@@ -110,14 +110,19 @@ def check_name(name: str, where: str) -> str:
     return name
 
 
-def check_camera(camera: CameraDepth, where: str) -> None:
+def check_camera(camera: CameraDepth, where: str, *, may_be_blind: bool = False) -> None:
     """Find out whether a camera's depth can be worked with.
+
+    Args:
+        camera: What it saw.
+        where: File and camera, for the message.
+        may_be_blind: Depth without any measurement passes.
 
     Raises:
         InputError: The depth is none (see depth_image.check_depth), a kept frame has no stamp or score that can be
             one, or the intrinsics are those of another size.
     """
-    check_depth(camera.depth, where)
+    (with_holes if may_be_blind else check_depth)(camera.depth, where)
     for stamp, frame in camera.frames.items():
         with_holes(frame.depth, f"{where}, frame {stamp}")
         if not _INT64.min <= stamp <= _INT64.max:

@@ -33,12 +33,13 @@ MAX_KEPT = 1000
 _STAMP = re.compile(r"-?[0-9]{1,19}", re.ASCII)
 
 
-def load_depth_data(path: Path, *, frames: bool = True) -> dict[str, CameraDepth]:
+def load_depth_data(path: Path, *, frames: bool = True, blind: bool = False) -> dict[str, CameraDepth]:
     """Camera -> what its depth saw, sorted by name.
 
     Args:
         path: A file that save_depth_data wrote.
         frames: Whether to read the kept single frames too, which are most of the file.
+        blind: Whether to return cameras without any measurement too, rather than to refuse the file.
 
     Raises:
         InputError: The file cannot be read, is damaged, of another kind or version, or what it holds is no depth.
@@ -52,7 +53,7 @@ def load_depth_data(path: Path, *, frames: bool = True) -> dict[str, CameraDepth
         if not h5py.is_hdf5(path):
             raise InputError(f"{path}: is not an HDF5 file; give a depth store as --save-depth writes it.")
         with h5py.File(path, "r", locking=False) as file:
-            return _read(file, path, with_frames=frames)
+            return _read(file, path, with_frames=frames, blind=blind)
     except RigError:
         raise
     except OSError as error:
@@ -69,7 +70,7 @@ def _damaged(path: Path, error: Exception) -> InputError:
     return InputError(f"{path}: is cut off or damaged ({reason}); write it again with --save-depth.")
 
 
-def _read(file: Any, path: Path, *, with_frames: bool) -> dict[str, CameraDepth]:
+def _read(file: Any, path: Path, *, with_frames: bool, blind: bool) -> dict[str, CameraDepth]:
     kind, version, units = (_attribute(file, key) for key in ("format", "version", "units"))
     if kind != FORMAT:
         raise InputError(f"{path}: is HDF5, but not a depth store (format {kind!r}); give what --save-depth writes.")
@@ -85,7 +86,8 @@ def _read(file: Any, path: Path, *, with_frames: bool) -> dict[str, CameraDepth]
     if n_bytes > MAX_BYTES:
         raise InputError(f"{path}: holds over {MAX_BYTES >> 30} GiB of depth; keep fewer frames or cameras in a store.")
     return {
-        name: _read_camera(group, f"{path}: camera {name}", with_frames=with_frames) for name, group in groups.items()
+        name: _read_camera(group, f"{path}: camera {name}", with_frames=with_frames, blind=blind)
+        for name, group in groups.items()
     }
 
 
@@ -103,7 +105,7 @@ def _size(group: Any, where: str) -> tuple[int, int]:
     return height, width
 
 
-def _read_camera(group: Any, where: str, *, with_frames: bool) -> CameraDepth:
+def _read_camera(group: Any, where: str, *, with_frames: bool, blind: bool) -> CameraDepth:
     size = _size(group, where)
     optional: dict[str, Any] = {
         name: _array(group, name, size, where, kind)
@@ -112,7 +114,7 @@ def _read_camera(group: Any, where: str, *, with_frames: bool) -> CameraDepth:
     }
     try:
         camera = CameraDepth(
-            depth=_depth(group, size, where, check_depth),
+            depth=_depth(group, size, where, with_holes if blind else check_depth),
             K=_array(group, "intrinsics", (3, 3), where, np.float64),
             n_frames=_whole(group, "n_frames", where),
             baseline_m=_number(group, "baseline", where) if "baseline" in group.attrs else None,
@@ -122,7 +124,7 @@ def _read_camera(group: Any, where: str, *, with_frames: bool) -> CameraDepth:
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(where) else f"{where}: {message}") from error
-    check_camera(camera, where)
+    check_camera(camera, where, may_be_blind=blind)
     return camera
 
 

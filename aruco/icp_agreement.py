@@ -1,6 +1,6 @@
 """How well a camera's place fits what all cameras see, rough as the place may be.
 
-Owns      Witness, agreement: surfaces that meet, less surfaces that stand where another camera looks through.
+Owns      Witness, gaps, agreement: surfaces that meet, less surfaces that stand where another camera looks through.
 Leaves    exact association with noise to icp_match, proposing places to icp_votes.
 
 Clouds alone forgive too much: any place where walls meet walls looks well. What a camera sees through is empty.
@@ -21,7 +21,7 @@ from aruco.pose_math import Array, Pose, invert_transform, transform_points
 
 # One sample counts for each such cube, so that near surfaces do not outvote far ones by their number.
 _VOXEL_M = 0.2
-_MOST_ANGLE_DEG = 35.0
+MOST_ANGLE_DEG = 35.0
 # Biases of two cameras may part what belongs together by this many sigmas.
 _DOUBT_SIGMAS = 2.0
 
@@ -82,16 +82,40 @@ def agreement(
     return total
 
 
-def _tally(source: Witness, target: Witness, T_target_source: Pose, reach_m: float) -> float:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gaps:
+    """Samples of a source that are asked, and what a target measures on the same lines of sight."""
+
+    gap_m: Array  # (n,) along the target's normal; positive: in front of its surface
+    doubt_m: Array  # (n,) of both depths, one sigma
+    facing: Array  # (n,) cosine between the normals
+    point: Array  # (n, 3) of the target, in its frame
+    normal: Array  # (n, 3) likewise
+    on_floor: NDArray[np.bool_]  # (n,) one of both is floor
+    floor_on_floor: NDArray[np.bool_]  # (n,) both are
+
+
+def gaps(source: Witness, target: Witness, T_target_source: Pose) -> Gaps:
+    """Where the asked samples of a source stand before and behind what a target measures."""
     points = transform_points(T_target_source, source.points[source.asked])
     at, j = looked_up(points, target.cloud)
-    i = source.asked[at]
-    n = target.cloud.normals[j]
-    gap = ((points[at] - target.points[j]) * n).sum(axis=1)
-    facing = (source.cloud.normals[i] @ T_target_source[:3, :3].T * n).sum(axis=1)
-    doubt_m = np.hypot(source.doubt_m[i], target.doubt_m[j])
-    reach, counts = reach_m + _DOUBT_SIGMAS * doubt_m, 1.0 / (1.0 + (doubt_m / reach_m) ** 2)
-    met = (np.abs(gap) <= reach) & (facing >= math.cos(math.radians(_MOST_ANGLE_DEG)))
-    met &= ~(source.cloud.is_floor[i] | target.cloud.is_floor[j])
-    nearness = counts * (1.0 - (gap / reach) ** 2)
-    return float(nearness[met].sum()) - float(counts[gap > reach].sum())
+    i, n = source.asked[at], target.cloud.normals[j]
+    return Gaps(
+        gap_m=((points[at] - target.points[j]) * n).sum(axis=1),
+        doubt_m=np.hypot(source.doubt_m[i], target.doubt_m[j]),
+        facing=(source.cloud.normals[i] @ T_target_source[:3, :3].T * n).sum(axis=1),
+        point=target.points[j],
+        normal=n,
+        on_floor=source.cloud.is_floor[i] | target.cloud.is_floor[j],
+        floor_on_floor=source.cloud.is_floor[i] & target.cloud.is_floor[j],
+    )
+
+
+def _tally(source: Witness, target: Witness, T_target_source: Pose, reach_m: float) -> float:
+    found = gaps(source, target, T_target_source)
+    reach = reach_m + _DOUBT_SIGMAS * found.doubt_m
+    counts = 1.0 / (1.0 + (found.doubt_m / reach_m) ** 2)
+    met = (np.abs(found.gap_m) <= reach) & (found.facing >= math.cos(math.radians(MOST_ANGLE_DEG)))
+    met &= ~found.on_floor
+    nearness = counts * (1.0 - (found.gap_m / reach) ** 2)
+    return float(nearness[met].sum()) - float(counts[found.gap_m > reach].sum())

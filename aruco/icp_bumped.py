@@ -1,30 +1,32 @@
 """Cameras that were bumped, taken up where their surroundings place them instead of where they are said to stand.
 
-Owns      who is found elsewhere, what is known of such a camera, that a place which is refused leaves no trace, what is
-          told of it.
-Leaves    the search for a place to icp_global, whether a camera is moved there to icp_gates.
+Owns      what is known of a camera that was found, that a place which is refused leaves no trace, what is told of it.
+Leaves    who looks bumped and where it fits to icp_looking, whether a camera is moved there to icp_gates and
+          icp_confirm, sentences to icp_bumped_words.
+
+What was known of such a camera's pose is void: where clouds contradict it, it was not bumped by a few of its sigmas.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from loguru import logger
 
-from aruco import icp_words as words
+from aruco import icp_bumped_words as words
 from aruco.depth_bias import DepthBias
-from aruco.errors import InputError
 from aruco.floor_model import centre_jacobian
 from aruco.floor_plane import FloorPlane
-from aruco.icp_cloud import Cloud, cloud_of
-from aruco.icp_global import global_start
+from aruco.icp_confirm import doubt_about
+from aruco.icp_looking import Looked, bounds_of, looked_again, looked_at, search_clouds, way
 from aruco.icp_prior import Prior
 from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics
-from aruco.pose_math import Array, Pose, pose_distance
+from aruco.pose_math import Array, Pose
 
 Answer = tuple[dict[str, Pose], ICPMetrics]
 # What is known of a camera that was found elsewhere, one sigma. Proposals are off by 0.8 degrees and 4 cm in the
@@ -33,60 +35,41 @@ FOUND_TURN_RAD = math.radians(2.0)
 FOUND_SHIFT_M = 0.1
 
 
-def found_elsewhere(
+def looked_for(
     camera_data: Mapping[str, Mapping[str, Any]],
     poses: Mapping[str, Pose],
+    priors: Mapping[str, Prior],
     floor: FloorPlane | None,
     biases: Mapping[str, DepthBias],
     config: ICPConfig,
-) -> dict[str, Pose]:
-    """Where cameras seem to stand that do not stand where they are said to; the reference is taken to stand well.
-
-    Where several are found elsewhere, each is looked for once more without the others: one that was bumped makes those
-    beside it look bumped too.
+    refined: Callable[[Mapping[str, Pose]], Answer],
+) -> Answer:
+    """The registration in which bumped cameras are taken up where they were found.
 
     Args:
         camera_data: As of icp_registration.refine_with_icp.
         poses: Camera -> T_world_cam as given.
+        priors: Camera -> what is known of it.
         floor: Common floor in that world; None: there is none.
         biases: Camera -> depth bias in place of that of its data.
-        config: Bounds of a move, seed. Everything in sight takes part, whatever the region.
+        config: As of the registration. Everything in sight takes part in the search, whatever the region; see LOOK_DEG
+            for its bounds.
+        refined: Does the registration, with some cameras taken up elsewhere.
     """
-    full = replace(config, region="full")
-    clouds = _clouds(camera_data, poses, floor, biases, full)
-    suspects = _asked(clouds.keys() - {min(poses, default="")}, clouds, poses, full)
-    if len(suspects) > 1:
-        well = {name: cloud for name, cloud in clouds.items() if name not in suspects}
-        suspects = {name: T for s in suspects for name, T in _asked([s], {**well, s: clouds[s]}, poses, full).items()}
-    for name, T in suspects.items():
-        logger.debug("camera {} is found {} from where it is said to stand", name, words.move(*_way(poses[name], T)))
-    return suspects
+    clouds = search_clouds(camera_data, poses, floor, biases, config)
+    looked = looked_at(clouds, poses, priors, config)
 
+    def doubts(at: Mapping[str, Pose], metrics: ICPMetrics, name: str) -> str:
+        known = {**biases, **metrics.biases}
+        return doubt_about(name, search_clouds(camera_data, at, floor, known, config), at, metrics)
 
-def _clouds(
-    camera_data: Mapping[str, Mapping[str, Any]],
-    poses: Mapping[str, Pose],
-    floor: FloorPlane | None,
-    biases: Mapping[str, DepthBias],
-    config: ICPConfig,
-) -> dict[str, Cloud]:
-    clouds: dict[str, Cloud] = {}
-    for name in sorted(poses.keys() & camera_data.keys()):
-        try:
-            clouds[name] = cloud_of(
-                name, camera_data[name], config, T_world_cam=poses[name], floor=floor, bias=biases.get(name)
-            )
-        except InputError:  # said when clouds are made to be registered
-            continue
-    return clouds
-
-
-def _asked(
-    cameras: Collection[str], clouds: Mapping[str, Cloud], poses: Mapping[str, Pose], config: ICPConfig
-) -> dict[str, Pose]:
-    """The proposals for some cameras among others."""
-    asked = {name: global_start(clouds[name], list(clouds.values()), poses, config) for name in sorted(cameras)}
-    return {name: T for name, T in asked.items() if T is not None}
+    answer, refused = _believed(looked.found, refined, doubts)
+    again = looked_again(clouds, poses, answer[1], looked, refused, config)
+    if again.found.keys() != looked.found.keys():
+        left = {name: T for name, T in again.found.items() if name not in refused}
+        answer, more = _believed(left, refined, doubts)
+        refused |= more
+    return answer[0], _told(answer[1], (poses, answer[0]), again, refused, bounds_of(config))
 
 
 def found_prior(T_world_cam: Pose) -> Prior:
@@ -96,53 +79,76 @@ def found_prior(T_world_cam: Pose) -> Prior:
     return Prior(T_world_cam=T_world_cam, covariance=back @ at_centre @ back.T)
 
 
-def believed(
-    given: Mapping[str, Pose], found: Mapping[str, Pose], refined: Callable[[Mapping[str, Pose]], Answer]
-) -> Answer:
-    """The answer in which all cameras that are taken up elsewhere are also moved there.
+# ---------------------------------------------------------------------------------------------------- what is believed
+
+
+def _believed(
+    found: Mapping[str, Pose],
+    refined: Callable[[Mapping[str, Pose]], Answer],
+    doubts: Callable[[Mapping[str, Pose], ICPMetrics, str], str],
+) -> tuple[Answer, dict[str, tuple[Pose, str]]]:
+    """The answer in which all cameras that are taken up elsewhere are also moved there, and why others are not.
 
     A place that is refused must not have pulled anybody: all is done again as if it had never been proposed.
 
     Args:
-        given: Camera -> T_world_cam where it is said to stand.
         found: Camera -> where it seems to stand.
         refined: Does the registration, with cameras taken up elsewhere.
+        doubts: What speaks against a camera's place in an answer; empty: nothing.
     """
-    left, refused = dict(found), dict[str, str]()
+    left, refused = dict(found), dict[str, tuple[Pose, str]]()
     while True:
         poses, metrics = refined(left)
-        out = {name: metrics.cameras.get(name) for name in left if name not in metrics.moved}
+        out = {name: why for name in left if (why := _refusal(name, metrics) or doubts(poses, metrics, name))}
         if not out:
-            return poses, _told(metrics, given, left, {name: (found[name], why) for name, why in refused.items()})
-        for name, move in out.items():
-            refused[name] = metrics.message if move is None else move.reason
-            logger.debug("camera {}: the place found is refused: {}", name, refused[name])
+            return (poses, metrics), refused
+        for name, why in out.items():
+            refused[name] = found[name], why
+            logger.info("camera {}: the place found is refused: {}", name, why)
             del left[name]
+
+
+def _refusal(camera: str, metrics: ICPMetrics) -> str:
+    """Why the gates did not let a camera go where it was found."""
+    if camera in metrics.moved:
+        return ""
+    return metrics.cameras[camera].reason if camera in metrics.cameras else metrics.message
+
+
+# ----------------------------------------------------------------------------------------------------- what is told
 
 
 def _told(
     metrics: ICPMetrics,
-    given: Mapping[str, Pose],
-    taken: Mapping[str, Pose],
+    before_after: tuple[Mapping[str, Pose], Mapping[str, Pose]],
+    looked: Looked,
     refused: Mapping[str, tuple[Pose, str]],
+    within: tuple[float, float],
 ) -> ICPMetrics:
+    given, new = before_after
     cameras = dict(metrics.cameras)
-    for name, T in taken.items():
-        cameras[name] = _found(cameras[name], _way(given[name], T))
+
+    def retold(name: str, reason: Callable[[str], str]) -> None:
+        before = cameras.get(name, CameraMove(accepted=False, reason=metrics.message))
+        cameras[name] = replace(before, reason=reason(before.reason))
+
+    gone = {name: way(given[name], new[name]) for name in sorted(looked.found.keys() - refused.keys())}
+    for name, moved in gone.items():
+        cameras[name] = _found(cameras[name], way(given[name], looked.found[name]), moved)
     for name, (T, why) in refused.items():
-        move = cameras.get(name, CameraMove(accepted=False, reason=metrics.message))
-        cameras[name] = replace(move, reason=words.found_and_refused(move.reason, *_way(given[name], T), why))
-    message = " ".join([metrics.message, *words.bumped(sorted(taken), sorted(refused))])
-    return replace(metrics, cameras=dict(sorted(cameras.items())), message=message)
+        retold(name, partial(words.found_and_refused, way=way(given[name], T), why=why))
+    for name in looked.nowhere:
+        retold(name, partial(words.found_nowhere, others=looked.against[name], within=within))
+    if looked.reference is not None:
+        T = looked.T_reference
+        seen = None if T is None else way(given[looked.reference], T)
+        others = looked.against[looked.reference]
+        retold(looked.reference, partial(words.reference_bumped, others=others, way=seen))
+    told = words.summary(gone, sorted(refused), sorted(looked.nowhere), looked.reference)
+    return replace(metrics, cameras=dict(sorted(cameras.items())), message=" ".join([metrics.message, *told]))
 
 
-def _found(move: CameraMove, way: tuple[float, float]) -> CameraMove:
-    """A move from where the camera was found; its given pose was not asked."""
-    reason = words.found(*way, move.held_out_before_mm, move.held_out_after_mm, move.gain_sigmas)
-    return replace(move, reason=reason, prior_sigmas=math.nan)
-
-
-def _way(T_from: Pose, T_to: Pose) -> tuple[float, float]:
-    """Turn [deg] and shift [m]."""
-    turn, shift = pose_distance(T_from, T_to)
-    return math.degrees(turn), shift
+def _found(seen: CameraMove, off: tuple[float, float], moved: tuple[float, float]) -> CameraMove:
+    """A move from where the camera was said to stand; that pose was not asked."""
+    reason = words.found(*off, seen.held_out_before_mm, seen.held_out_after_mm, seen.gain_sigmas)
+    return replace(seen, reason=reason, rotation_deg=moved[0], translation_mm=1e3 * moved[1], prior_sigmas=math.nan)

@@ -25,13 +25,10 @@ from aruco.icp_types import ICPConfig
 from aruco.icp_view import View, usable_view
 from aruco.pose_math import Array, Pose, transform_points
 
-N_FOLDS = 4
-# Side of the squares of the image [px] that are held out together: four correlation cells, so that what is held out
-# shares errors with what is fitted along its rim only.
-BLOCK_PX = 112
 # Directions that are less well known pretend to know: their noise looks like structure, and is shared over a window.
 MAX_SIGMA_RAD = math.radians(6.0)
-_VERTICAL_SINE = math.sin(math.radians(30.0))
+# Walls and sides of things, with what noise does to their normals.
+_UPRIGHT_SINE = math.sin(math.radians(30.0))
 # Surfaces seen more from the side than this are not worth measuring; see depth_mask.mask_grazing.
 _MOST_GRAZING_DEG = 80.0
 # What lies under the floor by noise or bias belongs to the band above it.
@@ -56,10 +53,7 @@ class Cloud:
     normals: Array  # (n, 3) unit, towards the camera
     normal_sigma: Array  # (n,) [rad]; 0 where the normal is a large plane's
     cell: NDArray[np.intp]  # (n,) square of depth_noise.CORRELATION_PX, numbered from 0: its samples share errors
-    block: NDArray[np.intp]  # (n,) square of BLOCK_PX, numbered from 0: held out together
-    fold: NDArray[np.intp]  # (n,) 0 to N_FOLDS - 1, one for each block
     is_floor: Mask  # (n,)
-    is_vertical: Mask  # (n,) normal within 30 degrees of level
     given_bias: DepthBias | None
     n_frames: int
     focal_baseline: float | None
@@ -101,7 +95,6 @@ def cloud_of(
     """
     view = usable_view(camera, data, config.stride, bias)
     up = np.asarray(config.up, dtype=np.float64) if floor is None else floor.normal
-    seeds = [config.seed, zlib.crc32(camera.encode())]
     surfaces = fit_surfaces(view.squares, float(view.K[0, 0]), view.samples.sigma)
     planes = find_planes(
         view.samples,
@@ -110,20 +103,19 @@ def cloud_of(
         T_world_cam=T_world_cam,
         floor=floor,
         up=up,
-        rng=np.random.default_rng(seeds),
+        rng=np.random.default_rng([config.seed, zlib.crc32(camera.encode())]),
     )
     normals, normal_sigma = _directions(surfaces, planes)
     is_floor = (planes.label == 0) & planes.has_floor
-    is_vertical = np.abs(normals @ (T_world_cam[:3, :3].T @ up)) <= _VERTICAL_SINE
     keep = (surfaces.sound | (planes.label >= 0)) & ~planes.stray
     keep &= _faces_the_camera(view.samples.rays, normals) & (normal_sigma <= MAX_SIGMA_RAD)
     keep &= ~near_crease(view.squares, normals, keep)
     if floor is not None:
         heights = _heights(view.samples.points, planes.floor, floor, T_world_cam)
-        keep &= is_floor | _in_region(heights, is_vertical, config)
+        upright = np.abs(normals @ (T_world_cam[:3, :3].T @ up)) <= _UPRIGHT_SINE
+        keep &= is_floor | _in_region(heights, upright, config)
     chosen, grid = _thinned(view, keep, config.voxel_size)
     pixels = view.samples.pixels[chosen]
-    block = squares(pixels, BLOCK_PX)
     return Cloud(
         camera=camera,
         shape=view.shape,
@@ -139,10 +131,7 @@ def cloud_of(
         normals=normals[chosen],
         normal_sigma=normal_sigma[chosen],
         cell=squares(pixels, int(CORRELATION_PX)),
-        block=block,
-        fold=_folds(block, np.random.default_rng([*seeds, 1])),
         is_floor=is_floor[chosen],
-        is_vertical=is_vertical[chosen],
         given_bias=view.given_bias,
         n_frames=view.n_frames,
         focal_baseline=view.focal_baseline,
@@ -173,12 +162,12 @@ def _heights(points: Array, own: SeenPlane | None, floor: FloorPlane, T_world_ca
     return points @ own.normal + own.distance_m
 
 
-def _in_region(heights: Array, is_vertical: Mask, config: ICPConfig) -> Mask:
+def _in_region(heights: Array, upright: Mask, config: ICPConfig) -> Mask:
     """Samples (n,) that take part."""
     if config.region == "full":
         return np.ones(len(heights), dtype=bool)
     band = (heights >= -_BELOW_M) & (heights <= config.band_height)
-    return band | is_vertical if config.region == "hybrid" else band
+    return band | upright if config.region == "hybrid" else band
 
 
 def _thinned(view: View, keep: Mask, voxel_m: float) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
@@ -198,9 +187,3 @@ def _thinned(view: View, keep: Mask, voxel_m: float) -> tuple[NDArray[np.intp], 
     grid = np.full(view.squares.grid, -1, dtype=np.int32)
     grid[view.squares.row[index], view.squares.column[index]] = rank[member.ravel()]
     return index[first[order]], grid
-
-
-def _folds(block: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.intp]:
-    """The fold (n,) of each sample; folds hold equally many blocks, up to one."""
-    n_blocks = int(block.max(initial=-1)) + 1
-    return (rng.permutation(n_blocks) % N_FOLDS)[block]

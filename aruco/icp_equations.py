@@ -20,7 +20,8 @@ from aruco.floor_plane import FloorPlane, Mask, plane_axes
 from aruco.icp_cloud import Cloud
 from aruco.icp_match import Matches
 from aruco.icp_rows import FLOOR, PER_CAMERA, Index, Layout, Rows
-from aruco.pose_math import Array, Pose, exp_se3, make_pose, transform_points
+from aruco.icp_smooth import slopes_at
+from aruco.pose_math import Array, Pose, exp_se3, invert_transform, make_pose, transform_points
 
 # Real surfaces are no planes over a cell, and samples do not lie where their neighbours' samples do.
 SURFACE_M = 0.0015
@@ -33,6 +34,15 @@ UNSHARED = 0.6
 PART = 0.25
 # Gaps beyond this many sigma lose weight with their square: as deaf to strangers as Cauchy's, blind to none within.
 KAPPA = 2.5
+# Gaps are smaller than promised where promises hold for poses, because cells share errors with their neighbours and
+# those of a plane are smoothed: 0.56 to 0.6 of it on simulated rigs with furniture, 0.5 over floors. Less than that is
+# depth better than the noise model, as of another kind of sensor. No further than to the last: errors that are smooth
+# over patches go into poses and depth errors, and gaps do not tell them.
+USUAL_RATIO = 0.5
+LEAST_SCALE = 0.5
+MEDIAN_SIGMA = (
+    1.17  # relative standard deviation of a median of absolute normal numbers, times the root of their number
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,13 +62,6 @@ class State:
             bias={name: b + x[layout.bias(name)] for name, b in self.bias.items()},
             floor=self.floor + x[layout.floor],
         )
-
-    def corrected(self, clouds: Mapping[str, Cloud]) -> dict[str, Cloud]:
-        """The clouds with the state's depth errors taken out."""
-        return {
-            name: replace(cloud, depth_m=cloud.depth_m + self.bias[name] @ cloud.slopes)
-            for name, cloud in clouds.items()
-        }
 
     @property
     def plane(self) -> FloorPlane:
@@ -122,13 +125,17 @@ def pair_rows(
     there_q = transform_points(T_b, b.rays[j] * surfaces[b.camera][j, None])
     lever = np.where(first[:, None], there_p, there_q)
     arm = np.hstack([np.cross(lever, normal), normal])
+    # At the same place too, not where the sample lies that was met: moving a plane by a depth error and back by a turn
+    # must leave nothing. A centimetre would seem to tell depth errors by a bare floor.
+    error_a = _by_error(a, surfaces[a.camera], i, T_a, lever, normal)
+    error_b = _by_error(b, surfaces[b.camera], j, T_b, lever, normal)
     tilt_a, tilt_b = _along(a, i, T_a, normal), _along(b, j, T_b, normal)
     values = np.column_stack([
         gap,
         arm,
-        tilt_a[:, None] * a.slopes.T[i],
+        error_a,
         np.abs(tilt_a) * a.sigma_m[i],
-        -tilt_b[:, None] * b.slopes.T[j],
+        -error_b,
         np.abs(tilt_b) * b.sigma_m[j],
         (doubt * beside) ** 2 + SURFACE_M**2,
     ])  # fmt: skip
@@ -221,16 +228,30 @@ def weighted(rows: Rows, gap_m: Array, scale: float) -> Rows:
 
 
 def residual_scale(rows: Rows, gap_m: Array) -> float:
-    """How much larger gaps are than promised, at least 1: by their median, which strangers do not lift."""
+    """How many times the promised noise there is: by the median of gaps (m,), which strangers do not lift.
+
+    Below one only where gaps are clearly smaller than those of depth that is as noisy as promised.
+    """
     if not len(gap_m):
         return 1.0
-    return max(1.0, float(np.median(np.abs(gap_m) / np.sqrt(rows.variance))) / 0.6745)
+    ratio = float(np.median(np.abs(gap_m) / np.sqrt(rows.variance))) / 0.6745
+    if ratio >= 1.0:
+        return ratio
+    at_most = ratio * (1.0 + 2.0 * MEDIAN_SIGMA / len(gap_m) ** 0.5) / USUAL_RATIO
+    return min(1.0, max(LEAST_SCALE, at_most))
 
 
 def _unshared(shared_m: Array, cell: Index, count: Index) -> Array:
     """(g,) variance of what is not the same all over cells (g,), for parts of them of so many samples [m^2]."""
     whole = np.bincount(cell, count)[cell]
     return UNSHARED * shared_m**2 * np.maximum(1.0, PART * whole / count)
+
+
+def _by_error(cloud: Cloud, surface: Array, index: Index, T_world_cam: Pose, points: Array, normal: Array) -> Array:
+    """(k, 4) how far a camera's depth error takes its surface along the normal at points of the world."""
+    here = transform_points(invert_transform(T_world_cam), points)
+    along = ((points - T_world_cam[:3, 3]) * normal).sum(axis=1) / here[:, 2]
+    return along[:, None] * slopes_at(cloud, surface, index, here)
 
 
 def _along(cloud: Cloud, i: Index, T_world_cam: Pose, normal: Array) -> Array:

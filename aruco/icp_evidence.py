@@ -5,7 +5,9 @@ Leaves    the estimate with these to icp_solve.
 
 Each factor is the mean of its logarithm over what the linear equations make of it, times a log-normal prior. Depth
 errors of usual cameras are a prior for a rig whose cameras may all be better or worse: if nothing in the clouds asks
-for them, they are taken to be small, and the clouds then say much more of the poses.
+for them, they are taken to be small, and the clouds then say much more of the poses. Unknowns that different evidence
+tells have factors of their own (automatic relevance determination; MacKay, ASHRAE Transactions 100, 1994; Neal,
+Bayesian Learning for Neural Networks, 1996): what floors say of tilt and height is no testimony for yaw, x and z.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 from aruco.floor_evidence import SCALE_LOG_SIGMA
 from aruco.icp_equations import State
 from aruco.icp_normal import Normal
-from aruco.icp_prior import Known, Part, Scales, default_of
+from aruco.icp_prior import ASPECTS, Known, Part, Scales, default_of
 from aruco.pose_math import Array
 
 # Between cameras that somebody has just calibrated and ones that were dropped.
@@ -43,29 +45,32 @@ def told_scales(known: Known, state: State, clouds: Normal, M: Array, current: S
         biased: Whether depth errors are estimated.
     """
     parts = known.parts(state)
-    unknown = [c for c in known.layout.cameras if not known.given[c]]
+    unknown = [c for c in known.layout.cameras if not known.given(c)]
+    defaults = [[default_of(aspect, c) for c in unknown] for aspect in ASPECTS]
     now = {
-        **{default_of(c): current.poses[c] for c in unknown},
-        "given": next((current.poses[c] for c in known.layout.cameras if known.given[c]), 1.0),
-        "bias": current.bias,
-        "lean": current.lean,
-        "measured": 1.0,
+        **{name: current.default.get(name, 1.0) for names in defaults for name in names},
+        **{"given": current.given, "bias": current.bias, "lean": current.lean, "measured": 1.0},
     }
     now = {name: now[name] for name in parts}
     if biased:
         now.update(_told(clouds, parts, M, now, {name: values for name, values in _DEPTH.items() if name in parts}))
-    now.update(_told_defaults(clouds, parts, M, now, [default_of(c) for c in unknown]))
+    for names in defaults:
+        now.update(_told_defaults(clouds, parts, M, now, names))
     if "given" in parts:
         now.update(_told(clouds, parts, M, now, {"given": _POSES}))
         now["given"] = max(now["given"], 1.0)
-    poses = {c: now["given" if known.given[c] else default_of(c)] for c in known.layout.cameras}
-    return Scales(poses=poses, bias=now.get("bias", 1.0), lean=now.get("lean", 1.0))
+    return Scales(
+        given=now.get("given", 1.0),
+        default={name: now[name] for names in defaults for name in names},
+        bias=now.get("bias", 1.0),
+        lean=now.get("lean", 1.0),
+    )
 
 
 def _told_defaults(
     clouds: Normal, parts: Mapping[str, Part], M: Array, now: Mapping[str, float], names: Sequence[str]
 ) -> dict[str, float]:
-    """Factors of poses of which nobody has said how well they are known: one common to all, and each camera's own.
+    """Factors of one aspect of poses of which nobody has said it: one common to all cameras, and each one's own.
 
     One camera may have been displaced and the others be right; a factor for all would spoil these, and keep that one.
     """

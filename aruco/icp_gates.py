@@ -20,12 +20,12 @@ from loguru import logger
 from aruco import icp_words as words
 from aruco.floor_plane import FloorPlane
 from aruco.icp_cloud import Cloud
-from aruco.icp_heldout import Comparison, HeldOut, held_out
-from aruco.icp_objections import Case, prior_sigmas, worst_objection
+from aruco.icp_heldout import HeldOut, held_out
+from aruco.icp_objections import Case, Objection, prior_sigmas, worst_objection
 from aruco.icp_prior import Prior
 from aruco.icp_solve import Pair, Registration
-from aruco.icp_types import CameraMove, ICPConfig
-from aruco.pose_math import Array, Pose, pose_distance
+from aruco.icp_types import CameraMove, ICPConfig, Refusal
+from aruco.pose_math import Pose, pose_distance
 
 # A move of a millimetre or two, which is what clouds can add to a good pose, is hardly ever proved by itself. So the
 # moves of a camera and of those that overlap it are proved together, which chance does in 2 of a hundred cases in which
@@ -34,9 +34,11 @@ from aruco.pose_math import Array, Pose, pose_distance
 # that stay where they were wrong hold the others back.
 JOINT_SIGMAS = 2.0
 # Its own move must not be spoken against: squared distances, in their variances, must not grow by more than the one,
-# which is as little as one more stray cell, unless that is less than the other of their standard errors.
+# which is as little as one more stray cell, unless that is less than the other of their standard errors. What is asked
+# for proof is asked for this too: at one standard error one right move in twenty would be refused by chance, and a
+# camera that stays where it was wrong holds the others back.
 MAX_GROWTH = 2.0
-MAX_GROWTH_SIGMAS = 1.0
+MAX_GROWTH_SIGMAS = 2.0
 
 
 class Register(Protocol):
@@ -54,7 +56,6 @@ class Verdict:
     registration: Registration  # in which only cameras move whose move is kept
     moves: dict[str, CameraMove]  # of all cameras
     left_out: tuple[str, ...]  # cameras whose clouds were set aside
-    rounds: int  # registrations judged
 
 
 def set_aside(
@@ -94,12 +95,12 @@ def judge(
     # Each round refuses at least one camera; the reference's cloud may be set aside too.
     for rounds in range(1, len(start) + 2):
         for name in sorted({*registration.kept} - moves.keys()):
-            moves[name] = CameraMove(accepted=False, reason=words.meets_nothing(tuple(left_out)))
+            moves[name] = CameraMove(accepted=False, reason=words.meets_nothing(tuple(left_out)), refusal="unlinked")
         moving = [n for n in registration.layout.cameras if n != registration.reference and n not in registration.kept]
-        trial = _Trial(case=case, held=held_out(registration, seed=config.seed), alone=frozenset(alone), memo={})
+        trial = _Trial(case=case, held=held_out(registration, seed=config.seed), alone=frozenset(alone))
         objection = worst_objection(case, registration, moving)
         if objection is not None:
-            refused = {objection.camera: trial.objected(objection.camera, moving, objection.reason)}
+            refused = {objection.camera: trial.objected(objection, moving)}
             left_out.append(objection.camera)
         else:
             refused = trial.unproved(moving)
@@ -114,9 +115,7 @@ def judge(
     moves.update({name: trial.accepted(name, moving) for name in moving})
     if registration.reference not in moves:
         moves[registration.reference] = CameraMove(accepted=False, reason=words.is_reference())
-    return Verdict(
-        registration=registration, moves=dict(sorted(moves.items())), left_out=tuple(left_out), rounds=rounds
-    )
+    return Verdict(registration=registration, moves=dict(sorted(moves.items())), left_out=tuple(left_out))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,7 +125,6 @@ class _Trial:
     case: Case
     held: HeldOut
     alone: frozenset[str]
-    memo: dict[frozenset[str], Array]
 
     def unproved(self, moving: Sequence[str]) -> dict[str, CameraMove]:
         """Cameras to keep until held-out distances ask for all moves that are left."""
@@ -141,14 +139,15 @@ class _Trial:
         """Cameras whose move is not proved, while those away are kept already."""
         failing: dict[str, CameraMove] = {}
         for name in left:
-            own = self._compared((*away, name), away)
-            joint = self._compared((*away, *self._beside(name, left)), away).sigmas
+            own = self.held.compared((*away, name), away)
+            together = self._beside(name, left)
+            joint = self.held.compared((*away, *together), away).sigmas
             if own.gain < -MAX_GROWTH and own.sigmas < -MAX_GROWTH_SIGMAS:
                 reason = words.speaks_against(*self._size(name), -own.sigmas)
-                failing[name] = self.move(name, (name,), reason, away=away)
+                failing[name] = self.move(name, (name,), reason, "worse", away=away)
             elif joint < JOINT_SIGMAS:
-                reason = words.not_proved(*self._size(name), joint, JOINT_SIGMAS)
-                failing[name] = self.move(name, self._beside(name, left), reason, away=away)
+                reason = words.not_proved(*self._size(name), joint, len(together) - 1, JOINT_SIGMAS)
+                failing[name] = self.move(name, together, reason, "unproved", away=away)
         return failing
 
     def _beside(self, camera: str, moving: Sequence[str]) -> list[str]:
@@ -157,36 +156,43 @@ class _Trial:
         beside = {name for name in moving if (min(name, camera), max(name, camera)) in pairs} - self.alone
         return [name for name in moving if name == camera or (name in beside and camera not in self.alone)]
 
-    def objected(self, camera: str, moving: Sequence[str], reason: str) -> CameraMove:
+    def objected(self, objection: Objection, moving: Sequence[str]) -> CameraMove:
         """A move that something speaks against; of the reference, that all others are moved against it."""
-        return self.move(camera, moving if camera == self.held.registration.reference else (camera,), reason)
+        camera = objection.camera
+        together = moving if camera == self.held.registration.reference else (camera,)
+        return self.move(camera, together, objection.reason, objection.kind)
 
     def accepted(self, camera: str, moving: Sequence[str]) -> CameraMove:
         """A move that is kept."""
-        move = self.move(camera, self._beside(camera, moving), "")
-        before, after = move.held_out_before_mm, move.held_out_after_mm
-        return replace(move, accepted=True, reason=words.gained(before, after, move.gain_sigmas, move.prior_sigmas))
+        together = self._beside(camera, moving)
+        move = self.move(camera, together, "", "")
+        gaps = (move.held_out_before_mm, move.held_out_after_mm)
+        reason = words.gained(*self._size(camera), gaps, move.gain_sigmas, len(together) - 1, move.prior_sigmas)
+        return replace(move, accepted=True, reason=reason)
 
-    def move(self, camera: str, together: Sequence[str], reason: str, *, away: Sequence[str] = ()) -> CameraMove:
+    def move(
+        self, camera: str, together: Sequence[str], reason: str, refusal: Refusal, *, away: Sequence[str] = ()
+    ) -> CameraMove:
         """What is told of a refused move.
 
         Args:
             camera: Which.
             together: Cameras, this among them, with and without whose moves distances are compared.
             reason: Why it is refused.
+            refusal: The kind of that.
             away: Cameras that are kept either way.
         """
         reg = self.held.registration
-        before = self._gaps((*away, *together))
         turn_deg, shift_m = self._size(camera)
         return CameraMove(
             accepted=False,
             reason=reason,
+            refusal=refusal,
             rotation_deg=turn_deg,
             translation_mm=1e3 * shift_m,
-            held_out_before_mm=self.held.median_mm(camera, before),
-            held_out_after_mm=self.held.median_mm(camera, self._gaps(away)),
-            gain_sigmas=self._compared((*away, *together), away).sigmas,
+            held_out_before_mm=self.held.median_mm(camera, (*away, *together)),
+            held_out_after_mm=self.held.median_mm(camera, away),
+            gain_sigmas=self.held.compared((*away, *together), away).sigmas,
             prior_sigmas=math.nan if camera == reg.reference else prior_sigmas(self.case, reg, camera),
             unobservable=reg.unobservable.get(camera, ()),
         )
@@ -195,13 +201,3 @@ class _Trial:
         """Turn [deg] and shift [m] of a camera's move."""
         turn, shift = pose_distance(self.case.start[camera], self.held.registration.T_world_cam[camera])
         return math.degrees(turn), shift
-
-    def _compared(self, before: Collection[str], after: Collection[str]) -> Comparison:
-        """From cameras kept before to those kept after."""
-        return self.held.compared(self._gaps(before), self._gaps(after))
-
-    def _gaps(self, kept: Collection[str]) -> Array:
-        key = frozenset(kept)
-        if key not in self.memo:
-            self.memo[key] = self.held.gaps(key)
-        return self.memo[key]

@@ -6,7 +6,7 @@ Leaves    features to icp_features, votes to icp_votes, how well a place fits to
 
 In simulated rooms with biased depth, cameras turned by 20 degrees about any axis and shifted by 0.4 m are found again:
 23 of 24 where the constants here were chosen, 20 of 20 elsewhere, these to 0.8 degrees and 4 cm in the median and 1.6
-degrees and 14 cm at worst. For none of the 44 was another place proposed while it stood where it was said to.
+degrees and 14 cm at worst.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from loguru import logger
 
 from aruco.floor_plane import FloorPlane, detect_floor_plane, fit_plane
-from aruco.icp_agreement import Witness, agreement, first_of_voxels, witness
+from aruco.icp_agreement import Witness, agreement, first_of_voxels
 from aruco.icp_cloud import Cloud
 from aruco.icp_features import distinct_spots, matched_spots
 from aruco.icp_types import ICPConfig
@@ -58,9 +58,9 @@ _UP = np.array([0.0, 1.0, 0.0])
 
 
 def global_start(
-    source: Cloud, targets: Sequence[Cloud], T_world_cam: Mapping[str, Pose], config: ICPConfig
+    source: Witness, targets: Sequence[Witness], T_world_cam: Mapping[str, Pose], config: ICPConfig
 ) -> Pose | None:
-    """Another place where a camera fits better than where it is said to stand.
+    """The place where a camera fits best, if it fits clearly better there than where it is said to stand.
 
     Args:
         source: The cloud of the camera in question, best of the region "full".
@@ -70,18 +70,17 @@ def global_start(
 
     Returns:
         A proposal for T_world_cam of the source, right to a degree or two and a few centimetres, which nobody should
-        take without proof. None where the given place fits as well as any other, or nothing in sight tells places
-        apart.
+        take without proof; near the given place where that was off by little. None where the given place fits as well
+        as any other, or nothing in sight tells places apart.
     """
-    others = [target for target in targets if target.camera != source.camera and len(target)]
-    if not len(source) or not others:
+    rig = _Rig(source=source, others=[t for t in targets if t.camera != source.camera], T_world_cam=T_world_cam)
+    if not rig.others:
         return None
-    T_given = T_world_cam[source.camera]
-    T_level = _levelled(source, others, T_world_cam, config)
-    candidates = _proposed(source, others, T_world_cam, T_level, config)
+    T_given, clouds = T_world_cam[source.camera], [other.cloud for other in rig.others]
+    T_level = _levelled(source.cloud, clouds, T_world_cam, config)
+    candidates = _proposed(source.cloud, clouds, T_world_cam, T_level, config)
     if not candidates:
         return None
-    rig = _Rig(source=witness(source), others=[witness(c) for c in others], T_world_cam=T_world_cam)
     starts = _different(candidates, rig.fit(candidates, _ROUGH_REACH_M))
     places = [T_given, *(rig.climbed(T) for T in (T_level, *starts))]
     fit = rig.fit(places, _FINE_REACH_M)
@@ -184,9 +183,9 @@ def _surroundings(cloud: Cloud, T_world_cam: Pose) -> tuple[Array, Array]:
 
 
 def _chosen(places: Sequence[Pose], fit: Array, least_gain: float) -> Pose | None:
-    """The place that fits best, if that is clearly another one than the first and no third fits nearly as well."""
+    """The place that fits best, if that is clearly better than the first and none elsewhere fits nearly as well."""
     best = int(np.argmax(fit))
-    if _within(places[best], places[0], _SAME) or fit[best] - fit[0] < least_gain:
+    if fit[best] - fit[0] < least_gain:
         return None
     rivals = [f for T, f in zip(places, fit) if not _within(T, places[best], _SAME_TOP)]
     return places[best] if fit[best] - max(rivals, default=-math.inf) >= _LEAST_LEAD * abs(fit[best]) else None

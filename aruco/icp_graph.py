@@ -118,7 +118,8 @@ def build_pose_graph(
         reach are named in a warning.
 
     Raises:
-        InputError: A camera has no pose, or the reference is none of the cameras.
+        InputError: A camera has no pose, the reference is none of the cameras, or a converged pair's transform or
+            information is none.
     """
     import open3d as o3d
 
@@ -139,14 +140,21 @@ def build_pose_graph(
     node = {name: k for k, name in enumerate(order)}
     sure = tree if certain is None else set(certain)
     for (source, target), r in sorted(pair_results.items(), key=lambda item: item[0]):
-        if r.converged and source in node and target in node:
+        if r.converged and source in node and target in node and source != target:
             T = _rigid(r.transformation, f"pair {source}, {target}")
-            information = _in_source_frame(r.information_matrix, T)
+            information = _in_source_frame(_checked(r.information_matrix, source, target), T)
             uncertain = (source, target) not in sure
             graph.edges.append(
                 registration.PoseGraphEdge(node[source], node[target], T, information, uncertain=uncertain)
             )
     return graph
+
+
+def _checked(information: Any, source: str, target: str) -> Array:
+    matrix = np.asarray(information, dtype=np.float64)
+    if matrix.shape != (6, 6) or not np.isfinite(matrix).all():
+        raise InputError(f"pair {source}, {target}: its information is no (6, 6) of finite numbers; leave it out.")
+    return matrix
 
 
 def _in_source_frame(information: Array, T_target_source: Pose) -> Array:
@@ -157,7 +165,7 @@ def _in_source_frame(information: Array, T_target_source: Pose) -> Array:
     confuse what the pair knows with what it does not.
     """
     A = adjoint(T_target_source)
-    return A.T @ np.asarray(information, dtype=np.float64) @ A
+    return A.T @ information @ A
 
 
 def optimize_pose_graph(pose_graph: Any, *, reach_m: float = EDGE_REACH_M) -> Any:

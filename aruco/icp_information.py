@@ -7,7 +7,7 @@ Leaves    equations to icp_equations and icp_normal.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,6 @@ class PairInformation:
 def pair_information(
     rows: Rows,
     layout: Layout,
-    n_cells: int,
     errors: Sequence[Array],
     pair: tuple[str, str],
     T_world_cam: Mapping[str, Pose],
@@ -52,7 +51,6 @@ def pair_information(
     Args:
         rows: Of all pairs.
         layout: Of the unknowns.
-        n_cells: Of all cameras.
         errors: Of source and target: covariance (4, 4) of depth errors beforehand.
         pair: Source and target.
         T_world_cam: In the equations' world.
@@ -61,14 +59,13 @@ def pair_information(
         biased: Whether depth errors are unknown.
     """
     source, target = pair
-    place = layout.cameras.index(source), layout.cameras.index(target)
-    normal = summed(rows.only((rows.a == place[0]) & (rows.b == place[1])), layout, n_cells, scale=scale)
-    at = layout.pose(source)
+    places = layout.cameras.index(source), layout.cameras.index(target)
+    two, own, n_cells = _of_two(rows, places, pair)
+    normal = summed(own, two, n_cells, scale=scale)
+    at = two.pose(source)
     H = normal.H[at, at]
     if biased:
-        both = np.r_[
-            layout.bias(source).start : layout.bias(source).stop, layout.bias(target).start : layout.bias(target).stop
-        ]
+        both = np.r_[two.bias(source), two.bias(target)]
         known = np.zeros((8, 8))
         known[:4, :4] = np.linalg.inv(errors[0])
         known[4:, 4:] = np.linalg.inv(errors[1])
@@ -78,6 +75,15 @@ def pair_information(
     words = unobserved(prior, scaled_inverse(H + np.linalg.inv(prior)), T_world_cam[source][:3, 3])
     information = Ad.T @ H @ Ad
     return (information + information.T) / 2, words
+
+
+def _of_two(rows: Rows, places: tuple[int, int], pair: tuple[str, str]) -> tuple[Layout, Rows, int]:
+    """One pair's rows and cells as if there were no other cameras: those cost time and say nothing."""
+    own = rows.only((rows.a == places[0]) & (rows.b == places[1]))
+    cells, numbers = np.unique(np.stack([own.cell_a, own.cell_b]), return_inverse=True)
+    cell_a, cell_b = numbers.reshape(2, -1)
+    n = np.zeros(len(cell_a), dtype=np.intp)
+    return Layout(pair), replace(own, a=n, b=n + 1, cell_a=cell_a, cell_b=cell_b), len(cells)
 
 
 def unobserved(before: Array, after: Array, centre: Array) -> tuple[str, ...]:

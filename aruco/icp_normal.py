@@ -11,11 +11,15 @@ the rows say when everything that they share, across directions, pairs and the f
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from aruco.icp_rows import PER_CAMERA, Layout, Rows
 from aruco.pose_math import Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,11 +44,8 @@ def summed(rows: Rows, layout: Layout, n_cells: int, *, scale: float = 1.0) -> N
     from scipy.sparse import csr_array, eye_array
     from scipy.sparse.linalg import splu
 
-    size = layout.size
     # A row of less weight is one with more noise of its own.
     W = 1.0 / (rows.own + rows.variance * (1.0 / rows.weight - 1.0))
-    H = np.zeros((size + PER_CAMERA, size + PER_CAMERA))
-    g, mixed = np.zeros(size + PER_CAMERA), np.zeros((n_cells, size + PER_CAMERA))
     m = np.arange(len(rows.gap_m))
     second = rows.cell_b >= 0
     shared = csr_array(
@@ -55,28 +56,36 @@ def summed(rows: Rows, layout: Layout, n_cells: int, *, scale: float = 1.0) -> N
         shape=(len(m), n_cells),
     )
     weighted = csr_array(shared.multiply(W[:, None])).T.tocsr()  # (n_cells, m)
-    first_a, first_b = rows.columns(layout)
-    for pair in np.unique(first_a * (size + 1) + first_b):
-        at = np.flatnonzero(first_a * (size + 1) + first_b == pair)
-        columns = np.concatenate([k + np.arange(PER_CAMERA) for k in (first_a[at[0]], first_b[at[0]])])
-        J = np.hstack([rows.by_a[at], rows.by_b[at]])
-        WJ = J * W[at, None]
-        # einsum adds up in one order, BLAS in another for each number of threads.
-        H[np.ix_(columns, columns)] += np.einsum("mi,mj->ij", J, WJ)
-        g[columns] += np.einsum("mi,m->i", WJ, rows.gap_m[at])
-        mixed[:, columns] += weighted[:, at] @ J
+    # Sparse products add up in one order, BLAS in another for each number of threads. And of many cameras each cell
+    # meets few.
+    J = _derivatives(rows, layout)
+    WJ = csr_array(J.multiply(W[:, None]))
+    H, g, mixed = (J.T @ WJ).toarray(), WJ.T @ rows.gap_m, csr_array(weighted @ J)
     gap = weighted @ rows.gap_m
     chi2 = float(np.sum(W * rows.gap_m**2))
     if len(m):
         factor = splu(
             (eye_array(n_cells) + weighted @ shared).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
         )
-        solved = factor.solve(np.column_stack([mixed, gap]))
-        H -= np.einsum("mi,mj->ij", mixed, solved[:, :-1])
-        g -= np.einsum("mi,m->i", mixed, solved[:, -1])
+        solved = factor.solve(np.column_stack([mixed.toarray(), gap]))
+        H -= mixed.T @ solved[:, :-1]
+        g -= mixed.T @ solved[:, -1]
         chi2 -= float(np.sum(gap * solved[:, -1]))
-    H, g = H[:size, :size] / scale**2, g[:size] / scale**2
+    H, g = H / scale**2, g / scale**2
     return Normal(H=(H + H.T) / 2, g=g, chi2=chi2 / scale**2)
+
+
+def _derivatives(rows: Rows, layout: Layout) -> csr_array:
+    """(m, size) of gaps by all unknowns."""
+    from scipy.sparse import csr_array
+
+    first, second = rows.columns(layout)
+    places = np.concatenate([k[:, None] + np.arange(PER_CAMERA) for k in (first, second)], axis=1)
+    values = np.hstack([rows.by_a, rows.by_b])
+    # The floor has fewer unknowns than a camera; what is beyond the last of them is zero.
+    inside = places < layout.size
+    m = np.broadcast_to(np.arange(len(values))[:, None], places.shape)
+    return csr_array((values[inside], (m[inside], places[inside])), shape=(len(values), layout.size))
 
 
 def solved(normal: Normal, M: Array, x0: Array | None = None) -> Array:

@@ -22,7 +22,7 @@ from aruco.floor_plane import FloorPlane, plane_axes
 from aruco.icp_cloud import Cloud
 from aruco.icp_prior import Prior
 from aruco.icp_solve import Registration
-from aruco.icp_types import ICPConfig
+from aruco.icp_types import ICPConfig, Refusal
 from aruco.pose_math import Array, Pose, exp_so3, invert_transform, log_se3, log_so3, make_pose, pose_distance
 
 # Chi-square that is exceeded once in a thousand, by degrees of freedom.
@@ -33,7 +33,6 @@ _LEAST_TOLD = 0.25
 # Gaps this many times the promised noise are another surface, or no surface. Strangers within reach of a match, spread
 # evenly over 28 mm where noise is 6 mm, make it 3.4.
 MAX_MISFIT = 3.0
-_UP_TO = 0.9  # of a cloud's samples
 _MEDIAN_SIGMAS = 0.6745  # of a normal distribution
 # A camera's own floor may be worse by this and three sigma of what it knows of it: a move that is right in all else is
 # not refused for what depth cannot tell.
@@ -61,6 +60,7 @@ class Objection:
     """A limit that a camera's move exceeds."""
 
     camera: str
+    kind: Refusal
     excess: float  # how many times the limit
     reason: str
 
@@ -72,6 +72,7 @@ def worst_objection(case: Case, registration: Registration, moving: Sequence[str
     """
     clouds = (registration.reference, *moving) if moving else ()
     to_clouds = [o for name in clouds for o in _to_cloud(case, registration, name, moving)]
+    to_clouds = to_clouds or list(to_all_depths(case, registration, clouds))
     found = to_clouds or [
         *(o for name in clouds for o in _to_size(case, registration, name)),
         *(o for name in moving for o in _to_pose(case, registration, name)),
@@ -96,7 +97,7 @@ def _to_size(case: Case, registration: Registration, camera: str) -> Iterator[Ob
     excess = max(turn_deg / config.max_rotation_deg, shift / config.max_translation_m)
     if excess > 1:
         reason = words.too_far(turn_deg, shift, config.max_rotation_deg, config.max_translation_m)
-        yield Objection(camera=camera, excess=excess, reason=reason)
+        yield Objection(camera=camera, kind="too_far", excess=excess, reason=reason)
 
 
 def against_others(T_before: Mapping[str, Pose], T_after: Mapping[str, Pose], camera: str) -> tuple[float, float]:
@@ -114,20 +115,65 @@ def against_others(T_before: Mapping[str, Pose], T_after: Mapping[str, Pose], ca
 
 
 def _to_depth(case: Case, registration: Registration, camera: str) -> Iterator[Objection]:
-    if not case.config.depth_bias:
-        return
-    cloud, b = case.clouds[camera], registration.bias[camera]
-    measured = cloud.given_bias is not None and cloud.given_bias.covariance is not None
-    # Where all cameras' depth seems better than is believed of any, an ordinary one is no fault.
-    factors = [1.0 if measured else max(registration.bias_scale, 1.0), max(registration.lean_scale, 1.0)]
-    D = np.diag(np.repeat(factors, 2))
-    stated, believed = cloud.bias_covariance, D @ cloud.bias_covariance @ D
-    told = believed - registration.bias_covariance[camera]
-    chi2 = max(surprise(b, stated, stated), surprise(b, believed, told))
+    chi2 = _depth_surprise(case, registration, [camera])
     if chi2 > CHI2_999[4]:
-        error = float(np.quantile(np.abs(b @ cloud.slopes) / cloud.depth_m, _UP_TO))
-        reason = words.unbelievable_depth(error, math.sqrt(chi2), math.sqrt(CHI2_999[4]))
-        yield Objection(camera=camera, excess=math.sqrt(chi2 / CHI2_999[4]), reason=reason)
+        error = _depth_error(registration, case.clouds[camera])
+        reason = words.unbelievable_depth(*error, math.sqrt(chi2), math.sqrt(CHI2_999[4]))
+        yield Objection(camera=camera, kind="depth", excess=math.sqrt(chi2 / CHI2_999[4]), reason=reason)
+
+
+def to_all_depths(case: Case, registration: Registration, cameras: Sequence[str]) -> Iterator[Objection]:
+    """To the camera whose depth is least believable where only that of all together is not.
+
+    Where no camera sees more than the floor, an error that all have in common bends it hardly, and is worth a tilt of
+    each: it may grow to three sigma in every camera, which no single one need answer for.
+    """
+    from scipy.special import chdtri
+
+    heard = sorted({*cameras} & {name for pair in registration.pairs for name in pair})
+    if len(heard) < 2:
+        return
+    chi2, limit = _depth_surprise(case, registration, heard), float(chdtri(4 * len(heard), 0.001))
+    if chi2 > limit:
+        worst = max(heard, key=lambda name: _depth_surprise(case, registration, [name]))
+        error = _depth_error(registration, case.clouds[worst])
+        reason = words.unbelievable_depths(*error, math.sqrt(chi2), math.sqrt(limit))
+        yield Objection(camera=worst, kind="depth", excess=math.sqrt(chi2 / limit), reason=reason)
+
+
+def _depth_surprise(case: Case, registration: Registration, cameras: Sequence[str]) -> float:
+    """Chi-square of some cameras' depth errors, four numbers each.
+
+    Once by what is believed of any camera, and once by what the estimate takes for it less what clouds leave unknown.
+    """
+    if not case.config.depth_bias:
+        return 0.0
+    at = np.concatenate([np.r_[registration.layout.bias(name)] for name in cameras])
+    stated = np.zeros((len(at), len(at)))
+    believed = stated.copy()
+    for k, name in enumerate(cameras):
+        cloud, here = case.clouds[name], slice(4 * k, 4 * k + 4)
+        measured = cloud.given_bias is not None and cloud.given_bias.covariance is not None
+        # Where all cameras' depth seems better than is believed of any, an ordinary one is no fault.
+        factors = [1.0 if measured else max(registration.scales.bias, 1.0), max(registration.scales.lean, 1.0)]
+        D = np.diag(np.repeat(factors, 2))
+        stated[here, here], believed[here, here] = cloud.bias_covariance, D @ cloud.bias_covariance @ D
+    b = np.concatenate([registration.bias[name] for name in cameras])
+    told = believed - registration.joint[np.ix_(at, at)]
+    return max(surprise(b, stated, stated), surprise(b, believed, told))
+
+
+def _depth_error(registration: Registration, cloud: Cloud) -> tuple[float, float]:
+    """What a camera's depth is wrong by where its cloud meets others, and one sigma of that, as shares of depth.
+
+    Elsewhere the estimate goes on as lines do, and says nothing of the camera.
+    """
+    met = [m.i for (source, _), m in registration.matches.items() if source == cloud.camera]
+    here = np.unique(np.concatenate(met)) if met else np.arange(len(cloud))
+    slopes = cloud.slopes[:, here] / cloud.depth_m[here]
+    covariance = registration.bias_covariance[cloud.camera]
+    sigma = np.sqrt(np.einsum("in,ij,jn->n", slopes, covariance, slopes))
+    return float(np.median(np.abs(registration.bias[cloud.camera] @ slopes))), float(np.median(sigma))
 
 
 def _to_fit(registration: Registration, camera: str, moving: Sequence[str]) -> Iterator[Objection]:
@@ -140,7 +186,8 @@ def _to_fit(registration: Registration, camera: str, moving: Sequence[str]) -> I
         return
     misfit = float(np.median(np.abs(gaps.gap_m) / np.sqrt(gaps.variance))) / _MEDIAN_SIGMAS
     if misfit > MAX_MISFIT:
-        yield Objection(camera=camera, excess=misfit / MAX_MISFIT, reason=words.does_not_fit(misfit, MAX_MISFIT))
+        reason = words.does_not_fit(misfit, MAX_MISFIT)
+        yield Objection(camera=camera, kind="misfit", excess=misfit / MAX_MISFIT, reason=reason)
 
 
 def _to_prior(case: Case, registration: Registration, camera: str) -> Iterator[Objection]:
@@ -149,7 +196,7 @@ def _to_prior(case: Case, registration: Registration, camera: str) -> Iterator[O
     if size > limit:
         turn, shift = pose_distance(case.start[camera], registration.T_world_cam[camera])
         reason = words.against_prior(math.degrees(turn), shift, size, limit)
-        yield Objection(camera=camera, excess=size / limit, reason=reason)
+        yield Objection(camera=camera, kind="prior", excess=size / limit, reason=reason)
 
 
 def prior_sigmas(case: Case, registration: Registration, camera: str) -> float:
@@ -166,7 +213,7 @@ def prior_sigmas(case: Case, registration: Registration, camera: str) -> float:
     T_expected = case.start[reference] @ invert_transform(priors[reference].T_world_cam) @ priors[camera].T_world_cam
     twist = log_se3(registration.T_world_cam[camera] @ invert_transform(T_expected))
     off = centre_jacobian(T_expected[:3, 3]) @ twist
-    believed = sum((registration.prior_scale[name] ** 2 * S for name, S in given.items()), np.zeros((6, 6)))
+    believed = sum((registration.scales.given**2 * S for name, S in given.items()), np.zeros((6, 6)))
     told = believed - registration.pair_covariance(reference, camera)
     stated = given[reference] + given[camera]
     return math.sqrt(max(surprise(off, stated, stated), surprise(off, believed, told)))
@@ -212,7 +259,7 @@ def _to_floor(case: Case, registration: Registration, camera: str) -> Iterator[O
     limits = (MAX_TILT_GROWTH_DEG + FLOOR_SIGMAS * sigma_tilt_deg, MAX_RISE_GROWTH_M + FLOOR_SIGMAS * sigma_m)
     excess = max((after[k] - before[k]) / limits[k] for k in range(2))
     if excess > 1:
-        yield Objection(camera=camera, excess=excess, reason=words.floor_worse(before, after))
+        yield Objection(camera=camera, kind="floor", excess=excess, reason=words.floor_worse(before, after))
 
 
 def _own_floor(cloud: Cloud, bias: Array) -> tuple[Array, Array] | None:
@@ -256,7 +303,8 @@ def _to_common_floor(case: Case, registration: Registration, moving: Sequence[st
     if excess > 1:
         turned = {name: pose_distance(case.start[name], registration.T_world_cam[name])[0] for name in moving}
         worst = max(turned, key=lambda name: turned[name])
-        yield Objection(camera=worst, excess=excess, reason=words.common_floor_tilts(before, after))
+        reason = words.common_floor_tilts(before, after)
+        yield Objection(camera=worst, kind="floor", excess=excess, reason=reason)
 
 
 def _tilt_deg(normal: Array, up: Array) -> float:

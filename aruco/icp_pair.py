@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from aruco.errors import InputError
-from aruco.icp_types import ICPConfig, ICPResult
+from aruco.icp_types import VOXELS, ICPConfig, ICPResult
 from aruco.pose_math import Array, Pose, checked_pose, exp_se3, invert_transform, log_se3, transform_points
 
-VOXELS = (4, 2, 1)
 MIN_POINTS = 30  # five for each unknown
 NORMAL_RADIUS_VOXELS = 2.0
 # Noise of normals over two voxels would pretend to know x, z and yaw over a bare floor to fractions of a millimetre.

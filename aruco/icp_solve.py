@@ -20,12 +20,13 @@ from aruco.floor_plane import FloorPlane, Mask
 from aruco.icp_cloud import Cloud
 from aruco.icp_information import PairInformation, fit_of, pair_information, unobserved
 from aruco.icp_match import Matches
-from aruco.icp_normal import Normal, scaled_inverse, solved
+from aruco.icp_normal import Normal, scaled_inverse
 from aruco.icp_prior import Prior, Scales
 from aruco.icp_rows import Layout, Rows, followers
 from aruco.icp_steps import Fit, Pair, Setup, fitted, set_up
 from aruco.icp_types import ICPConfig
-from aruco.pose_math import Array, Pose, adjoint, invert_transform, log_se3
+from aruco.pose_math import Array, Pose, invert_transform, log_se3
+from aruco.uncertainty import carried
 
 __all__ = ["Normal", "PairInformation", "Prior", "Registration", "register"]
 
@@ -44,10 +45,8 @@ class Registration:
     pairs: dict[Pair, PairInformation]  # (a, b), a < b: source a, target b
     matches: dict[Pair, Matches]  # (source, target), both directions, at the end
     unobservable: dict[str, tuple[str, ...]]  # camera -> directions in which clouds say less than its prior, in words
-    scale: float  # factor on the noise promised, at least 1
-    prior_scale: dict[str, float]  # factor on the standard deviations of each camera's prior
-    bias_scale: float  # likewise of depth errors that nobody has measured
-    lean_scale: float  # of their growth across the image
+    scale: float  # factor on the noise promised; see icp_equations.residual_scale
+    scales: Scales  # how large errors of poses and depth were taken to be
     rounds: int  # relinearisations
     settled: bool
     # About the final state, in a world of its own: x changes poses by left twists there. See icp_rows.
@@ -59,22 +58,6 @@ class Registration:
     joint: Array  # (size, size) covariance of all unknowns, the reference as free as the others
     back: dict[str, Array]  # camera -> (6,) twist that takes it to its start, relative to the reference
     T_out_own: Pose  # from the equations' world to the returned one
-
-    @property
-    def scales(self) -> Scales:
-        """How large errors of poses and depth were taken to be."""
-        return Scales(poses=self.prior_scale, bias=self.bias_scale, lean=self.lean_scale)
-
-    def solution(self, kept: Collection[str] = ()) -> Array:
-        """(size,) best change of the unknowns from the final state when further cameras are kept.
-
-        They then stand at their start relative to the reference; their depth errors are free.
-        """
-        away = {*self.kept, *kept} - {self.reference}
-        x0 = np.zeros(self.layout.size)
-        for name in away:
-            x0[self.layout.pose(name)] = self.back[name]
-        return solved(self.clouds + self.prior, followers(self.layout, away, self.reference, self.frozen), x0)
 
     def pair_covariance(self, a: str, b: str) -> Array:
         """(6, 6) of the relative pose of two cameras: turn of b, shift of its centre, as seen from a, in world axes."""
@@ -101,6 +84,7 @@ def register(
     kept: Collection[str] = (),
     begin: Mapping[str, Pose] | None = None,
     scales: Scales | None = None,
+    start_covariances: Mapping[str, Array] | None = None,
 ) -> Registration:
     """Bring clouds together.
 
@@ -116,9 +100,21 @@ def register(
         begin: Camera -> T_world_cam where the estimate begins for it in place of its start, if it is free to move.
         scales: How large errors of poses and depth are; None: clouds tell. With cameras kept they would be told of a
             part of the rig.
+        start_covariances: Camera -> (6, 6) of its pose in ``start``, of depth too where that made it, for what is told
+            of cameras that stay; default: that of the prior.
     """
     setup = set_up(
-        clouds, start, priors, pairs, config, floor=floor, reference=reference, kept=kept, begin=begin, told=scales
+        clouds,
+        start,
+        priors,
+        pairs,
+        config,
+        floor=floor,
+        reference=reference,
+        kept=kept,
+        begin=begin,
+        told=scales,
+        start_covariances=start_covariances,
     )
     fit = fitted(setup)
     areas = dict(pairs) if isinstance(pairs, Mapping) else dict.fromkeys(setup.pairs, float("nan"))
@@ -137,7 +133,7 @@ def _answer(setup: Setup, fit: Fit, start: Mapping[str, Pose], areas: Mapping[Pa
         T_world_cam={name: start[name] if name in still else T_out_own @ T[name] for name in layout.cameras},
         bias=fit.state.bias,
         bias_covariance={name: joint[layout.bias(name), layout.bias(name)] for name in layout.cameras},
-        covariance=_covariances(setup, fit, joint, T_out_own),
+        covariance=_covariances(setup, fit, joint, T_restored),
         reference=reference,
         kept=setup.kept,
         floor=fit.state.plane.moved(T_out_own) if setup.floors else None,
@@ -145,9 +141,7 @@ def _answer(setup: Setup, fit: Fit, start: Mapping[str, Pose], areas: Mapping[Pa
         matches=fit.matches,
         unobservable={name: _unobserved(setup, fit, name, joint) for name in layout.cameras},
         scale=fit.noise,
-        prior_scale=fit.scales.poses,
-        bias_scale=fit.scales.bias,
-        lean_scale=fit.scales.lean,
+        scales=fit.scales,
         rounds=fit.rounds,
         settled=fit.settled,
         layout=layout,
@@ -164,23 +158,43 @@ def _answer(setup: Setup, fit: Fit, start: Mapping[str, Pose], areas: Mapping[Pa
     )
 
 
-def _covariances(setup: Setup, fit: Fit, joint: Array, T_out_own: Pose) -> dict[str, Array]:
+def _covariances(setup: Setup, fit: Fit, joint: Array, T_restored: Pose) -> dict[str, Array]:
     """(6, 6) of the poses returned: as clouds and priors know them, but for standing where the reference stood.
 
-    The estimate's error x and that of the reference's given pose e have E[x e^T] = the joint covariance's block. Moved
-    back by e - x of the reference, a camera has the covariance P_cc + S_r - P_rr: what the reference's given pose is
-    worse than estimated.
+    The estimate's error x and that of where the reference was at the start, e, have E[x e^T] = the joint covariance's
+    block, for the start is made of less than the estimate is. Moved back by e - x of the reference, a camera has the
+    covariance P_cc + S_r - P_rr: what the reference's start is worse than estimated. A kept camera is known as it was
+    at the start.
     """
-    at = setup.layout.pose(setup.reference)
-    more = setup.known.covariance(setup.reference, fit.scales) - joint[at, at]
-    Ad = adjoint(T_out_own)
+    P = {
+        name: carried(joint[at, at], T_restored)
+        for name, at in ((name, setup.layout.pose(name)) for name in setup.layout.cameras)
+    }
+    P_r = P[setup.reference]
+    worse = _at_least(_start_covariance(setup, fit, setup.reference), P_r) - P_r
     out: dict[str, Array] = {}
     for name in setup.layout.cameras:
-        at = setup.layout.pose(name)
-        S = setup.known.covariance(name, fit.scales) if name in setup.kept else joint[at, at] + more
-        S = Ad @ S @ Ad.T
+        stays = name in (setup.reference, *setup.kept)
+        S = carried(
+            _start_covariance(setup, fit, name) if stays else P[name] + worse, invert_transform(setup.T_own_world)
+        )
         out[name] = (S + S.T) / 2
     return out
+
+
+def _start_covariance(setup: Setup, fit: Fit, camera: str) -> Array:
+    """(6, 6) of a camera at the start: as told, or as the prior has it."""
+    told = setup.start_covariance.get(camera)
+    return setup.known.covariance(camera, fit.scales) if told is None else told
+
+
+def _at_least(S: Array, least: Array) -> Array:
+    """A covariance that promises nowhere more than another does: models of its makers differ."""
+    L = np.linalg.cholesky(least)
+    whitened = np.linalg.solve(L, np.linalg.solve(L, S).T)
+    values, vectors = np.linalg.eigh((whitened + whitened.T) / 2)
+    back = L @ vectors
+    return back @ np.diag(np.maximum(values, 1.0)) @ back.T
 
 
 def _unobserved(setup: Setup, fit: Fit, camera: str, joint: Array) -> tuple[str, ...]:
@@ -197,7 +211,6 @@ def _pair(setup: Setup, fit: Fit, pair: Pair, area_m2: float) -> PairInformation
     information, words = pair_information(
         fit.rows,
         setup.layout,
-        fit.n_cells,
         [setup.known.bias_covariance(name, fit.scales) for name in pair],
         pair,
         fit.state.T_world_cam,

@@ -19,13 +19,14 @@ from aruco.icp_match import Matches, match
 from aruco.icp_normal import Normal, scaled_inverse, solved, summed
 from aruco.icp_prior import Known, Prior, Scales
 from aruco.icp_rows import BIAS, Layout, Rows, followers
-from aruco.icp_smooth import smoothed
-from aruco.icp_types import ICPConfig
+from aruco.icp_smooth import corrected, smoothed
+from aruco.icp_types import VOXELS, ICPConfig
 from aruco.pose_math import Array, Pose, invert_transform, make_pose
+from aruco.uncertainty import carried
 
 Pair = tuple[str, str]
-# Scales in voxels, and of how many samples one is looked up: neighbours share their errors anyway.
-_SCALES = ((4.0, 4), (2.0, 4), (1.0, 2))
+# At each of the scales VOXELS, of how many samples one is looked up: neighbours share their errors anyway.
+_EVERY = (4, 4, 2)
 # Steps below this share of a standard deviation are none.
 _SETTLED = 0.1
 # Matches that change to and fro with the state move it for ever. After so many steps since the smallest that is what
@@ -49,6 +50,7 @@ class Setup:
     known: Known
     start: State
     begin: State  # where the way begins: at the start, but for cameras that are thought to stand elsewhere
+    start_covariance: dict[str, Array]  # (6, 6) of cameras at the start, where it is known apart from the prior's
     T_own_world: Pose
     frozen: Mask  # (size,) unknowns that are not estimated
     M: Array  # (size, k) all unknowns by the free ones
@@ -82,6 +84,7 @@ def set_up(
     kept: Collection[str],
     begin: Mapping[str, Pose] | None = None,
     told: Scales | None = None,
+    start_covariances: Mapping[str, Array] | None = None,
 ) -> Setup:
     """See icp_solve.register."""
     layout, pairs = Layout(tuple(sorted(clouds))), tuple(sorted(pairs))
@@ -114,11 +117,11 @@ def set_up(
         known=Known(
             layout=layout,
             poses={name: priors[name].moved(T_own_world) for name in names},
-            given={name: priors[name].covariance is not None for name in names},
             clouds=clouds,
         ),
         start=at_start,
         begin=replace(at_start, T_world_cam={**at_start.T_world_cam, **elsewhere}),
+        start_covariance={name: carried(S, T_own_world) for name, S in (start_covariances or {}).items()},
         T_own_world=T_own_world,
         frozen=frozen,
         M=followers(layout, stay, reference, frozen),
@@ -128,9 +131,8 @@ def set_up(
 
 def fitted(setup: Setup) -> Fit:
     """The most probable state, from coarse matches to fine ones."""
-    first = setup.told or Scales(poses=dict.fromkeys(setup.layout.cameras, 1.0))
-    fit = _met(setup, setup.begin, first, scale=0)
-    rounds, settled, last = 0, False, len(_SCALES) - 1
+    fit = _met(setup, setup.begin, setup.told or Scales(), scale=0)
+    rounds, settled, last = 0, False, len(VOXELS) - 1
     for scale, most in enumerate(setup.config.max_iterations):
         steps: list[float] = []
         over = False
@@ -151,9 +153,10 @@ def _is_over(steps: Sequence[float], most: int) -> bool:
 
 def _met(setup: Setup, state: State, scales: Scales, *, scale: int) -> Fit:
     """What meets at a state, and the equations about it."""
-    voxels, every = _SCALES[scale]
-    reach = voxels * setup.config.voxel_size * setup.config.max_correspondence_distance_factor
-    seen = state.corrected(setup.clouds)
+    every = _EVERY[scale]
+    reach = VOXELS[scale] * setup.config.voxel_size * setup.config.max_correspondence_distance_factor
+    about = {name: corrected(setup.clouds[name], setup.surfaces[name], b) for name, b in state.bias.items()}
+    seen, surfaces = {name: cloud for name, (cloud, _) in about.items()}, {n: depth for n, (_, depth) in about.items()}
     some = {name: _every(cloud, every) for name, cloud in seen.items()}
     matches: dict[Pair, Matches] = {}
     parts: list[Rows] = []
@@ -163,10 +166,8 @@ def _met(setup: Setup, state: State, scales: Scales, *, scale: int) -> Fit:
             found = match(some[source], seen[target], T, reach)
             matches[source, target] = replace(found, i=every * found.i)
         both = setup.config.method == "gicp"
-        parts.append(
-            pair_rows(state, seen, setup.surfaces, setup.layout, matches[a, b], matches[b, a], both_normals=both)
-        )
-    parts += [floor_rows(state, seen, setup.surfaces, setup.layout, name, every=every) for name in setup.floors]
+        parts.append(pair_rows(state, seen, surfaces, setup.layout, matches[a, b], matches[b, a], both_normals=both))
+    parts += [floor_rows(state, seen, surfaces, setup.layout, name, every=every) for name in setup.floors]
     rows, n_cells = joined(parts, setup.clouds, setup.layout)
     noise = residual_scale(rows, rows.gap_m)
     rows = weighted(rows, rows.gap_m, noise)
@@ -198,10 +199,7 @@ def _every(cloud: Cloud, step: int) -> Cloud:
         normals=cloud.normals[::step],
         normal_sigma=cloud.normal_sigma[::step],
         cell=cloud.cell[::step],
-        block=cloud.block[::step],
-        fold=cloud.fold[::step],
         is_floor=cloud.is_floor[::step],
-        is_vertical=cloud.is_vertical[::step],
     )
 
 

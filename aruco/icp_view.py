@@ -40,7 +40,6 @@ _PER_CELL = (CORRELATION_PX / TEMPORAL_CORRELATION_PX) ** 2
 class View:
     """The usable depth of one camera, given bias taken out."""
 
-    camera: str
     shape: tuple[int, int]
     K: Array  # (3, 3)
     squares: Squares
@@ -94,7 +93,6 @@ def usable_view(camera: str, data: Mapping[str, Any], stride: int, bias: DepthBi
         stride=stride,
     )
     return View(
-        camera=camera,
         shape=(depth.shape[0], depth.shape[1]),
         K=K,
         squares=squares,

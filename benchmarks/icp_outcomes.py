@@ -12,13 +12,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from loguru import logger
 
-from aruco.icp_registration import ICPConfig, ICPMetrics, refine_with_icp
-from aruco.icp_types import Method
+from aruco.icp_types import ICPConfig, ICPMetrics, Method
 from aruco.pose_math import Array, Pose, adjoint, invert_transform, skew
 from benchmarks.child import ONE_THREAD
 from benchmarks.icp_rigs import STARTS, commanded, floors_seen, start_poses
@@ -28,15 +27,24 @@ from rigcal.icp_note import Registration
 
 CORES = 2
 PLAIN: dict[str, Method] = {"plain": "point_to_plane", "plain_gicp": "gicp"}
+# A rig is harmed when its median pair error grows by more than either.
+HARM_SHARE, HARM_MM = 0.05, 1.0
 Key = TypeVar("Key")
 Value = TypeVar("Value")
+
+
+class Room(NamedTuple):
+    """Which rig, and whether things stand amid its cameras."""
+
+    seed: int
+    furnished: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """One rig, from one start."""
 
-    seed: int
+    room: Room
     start: str
     biased: bool
     before_mm: float  # median error of relative poses, as given
@@ -46,41 +54,61 @@ class Outcome:
     moved: dict[str, int] = field(default_factory=dict)  # cameras, by way
     seconds: dict[str, float] = field(default_factory=dict)
 
+    def ratio(self, way: str) -> float:
+        """Its error as a way has left it over what it was given with."""
+        return self.after_mm[way] / self.before_mm
+
+    def ratio_by_icp(self, way: str) -> float:
+        """The same over what levelling had left."""
+        return self.after_mm[way] / self.levelled_mm[way]
+
+    def growth(self, way: str) -> float:
+        """How much worse a way has made it than it was given, in units of what counts as harm; below 0 is better."""
+        return _growth(self.before_mm, self.after_mm[way])
+
+    def growth_by_icp(self, way: str) -> float:
+        """The same against what levelling had left."""
+        return _growth(self.levelled_mm[way], self.after_mm[way])
+
+
+def _growth(before_mm: float, after_mm: float) -> float:
+    return (after_mm - before_mm) / max(HARM_SHARE * before_mm, HARM_MM)
+
 
 def spread(measure: Callable[[Key], Value], keys: Sequence[Key]) -> list[Value]:
     """A measurement of each key, in processes of one thread each; the order of keys is kept."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
     try:
-        with ProcessPoolExecutor(CORES, mp_context=get_context("spawn"), initializer=logger.remove) as pool:
+        with ProcessPoolExecutor(CORES, mp_context=get_context("spawn"), initializer=_be_silent) as pool:
             return list(pool.map(measure, keys))
     finally:
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.__setitem__(name, value)
 
 
-def outcomes(seed: int) -> list[Outcome]:
-    """One rig from every start, its depth biased and not, by the command's way."""
-    return [_commanded(*case) for case in _cases(seed)]
+def _be_silent() -> None:
+    # Handed over itself, logger.remove would arrive as that of a copy.
+    logger.remove()
 
 
-def direct_outcomes(seed: int) -> list[Outcome]:
-    """The same registered as it is, without levelling, with covariances."""
-    return [_direct(*case) for case in _cases(seed)]
+def outcomes(room: Room) -> list[Outcome]:
+    """One rig from every start, its depth biased and not, by the command's way, with covariances and without."""
+    return [_commanded(*case) for case in _cases(room)]
 
 
-def plain_outcomes(seed: int) -> list[Outcome]:
+def plain_outcomes(room: Room) -> list[Outcome]:
     """The same by the plain recipe."""
-    return [_plain(*case) for case in _cases(seed)]
+    return [_plain(*case) for case in _cases(room)]
 
 
-def _cases(seed: int) -> Iterator[tuple[Outcome, DepthRig, dict[str, Pose], dict[str, Array]]]:
+def _cases(room: Room) -> Iterator[tuple[Outcome, DepthRig, dict[str, Pose], dict[str, Array]]]:
     """What has happened to a rig so far, which is nothing; the rig, poses to start from and their covariances."""
     for biased in (False, True):
-        rig = depth_rig(seed, biased=biased)
+        rig = depth_rig(room.seed, biased=biased, furnished=room.furnished)
         for start in STARTS:
-            poses, covariances = start_poses(rig, start, seed)
-            nothing = Outcome(seed=seed, start=start, biased=biased, before_mm=median_mm(poses, rig.T_world_cam))
+            poses, covariances = start_poses(rig, start, room.seed)
+            nothing = Outcome(room=room, start=start, biased=biased, before_mm=median_mm(poses, rig.T_world_cam))
             yield nothing, rig, poses, covariances
 
 
@@ -101,16 +129,12 @@ def _commanded(outcome: Outcome, rig: DepthRig, poses: dict[str, Pose], covarian
     )
 
 
-def _direct(outcome: Outcome, rig: DepthRig, poses: dict[str, Pose], covariances: dict[str, Array]) -> Outcome:
-    floors = floors_seen(rig, poses)
-    found, metrics = refine_with_icp(rig.camera_data, poses, floors, ICPConfig(), covariances=covariances)
-    moved = {"direct": len(metrics.moved)}
-    return replace(outcome, after_mm={"direct": median_mm(found, rig.T_world_cam)}, moved=moved)
-
-
 def _plain(outcome: Outcome, rig: DepthRig, poses: dict[str, Pose], covariances: dict[str, Array]) -> Outcome:
+    del covariances  # of which the recipe knows nothing
     floors = floors_seen(rig, poses)
-    found = {way: plain_icp(rig.camera_data, poses, floors, ICPConfig(method=method)) for way, method in PLAIN.items()}
+    found: dict[str, dict[str, Pose]] = {}
+    for way, method in PLAIN.items():
+        found[way], found[f"{way}_gated"] = plain_icp(rig.camera_data, poses, floors, ICPConfig(method=method))
     return replace(outcome, after_mm={way: median_mm(T, rig.T_world_cam) for way, T in found.items()})
 
 

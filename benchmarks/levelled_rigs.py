@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from aruco.floor_model import centre_jacobian
 from aruco.ground_plane import GroundPlaneConfig, GroundPlaneMetrics, refine_ground_from_depth
 from aruco.model import Camera
 from aruco.pose_math import Array, Pose, exp_so3, make_pose, transform_points
+from benchmarks.furnished_rooms import things_amid_cameras
 from rigcal.quality.truth import pair_errors
 from rigcal.sim import Simulation, simulate
 from rigcal.sim.noise import DepthBias as SimulatedBias
@@ -28,6 +29,10 @@ from rigcal.sim.scene import Panel, Scene, target_panels
 from rigcal.sim.simulation import focal_baseline
 
 N_POOLED = 10
+# Rigs of which depth is kept: a suite asks for the same one several times over, one after the other.
+_KEPT = 4
+# Of the chance that furnishes rooms, apart from the simulator's own.
+_FURNISHED = 91
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,23 +45,40 @@ class DepthRig:
     target_m: Array  # (3,) the middle of the target
 
 
-@cache
-def _simulated(seed: int) -> tuple[Simulation, Any, dict[str, Any]]:
+@lru_cache(_KEPT)
+def _simulated(seed: int, furnished: bool = False) -> tuple[Simulation, Any, dict[str, Any]]:
     """A rig, its twin without bias, and each camera's exact depth."""
     simulation, unbiased = (simulate("box-static", seed=seed, depth_bias=biased) for biased in (True, False))
-    scene = Scene(panels=(*_room(simulation), *target_panels(simulation.target, simulation.T_world_target[0])))
-    cameras = simulation.recording.cameras
+    panels = [*_room(simulation), *target_panels(simulation.target, simulation.T_world_target[0])]
+    if furnished:
+        panels += things_amid_cameras(_target_m(simulation), np.random.default_rng([_FURNISHED, seed]))
+    scene, cameras = Scene(panels=tuple(panels)), simulation.recording.cameras
     exact = {camera.name: render_depth(scene, camera, simulation.T_world_cam[camera.name]) for camera in cameras}
     return simulation, unbiased, exact
 
 
-def depth_rig(seed: int, *, biased: bool) -> DepthRig:
-    """A simulated rig's depth, pooled over ten frames, without rendering any picture."""
-    with_bias, without, exact = _simulated(seed)
+def depth_rig(seed: int, *, biased: bool, furnished: bool = False) -> DepthRig:
+    """A simulated rig's depth, pooled over ten frames, without rendering any picture.
+
+    Args:
+        seed: Of the rig, its room and its noise.
+        biased: Whether each camera's depth is off by a scale and a disparity of its own.
+        furnished: Whether things stand amid the cameras too: see furnished_rooms.
+    """
+    with_bias, without, exact = _simulated(seed, furnished)
     simulation = with_bias if biased else without
     data = measured_data(simulation.recording.cameras, exact, simulation.depth_bias, simulation.rig.depth_noise, seed)
-    place = transform_points(simulation.T_world_target[0], simulation.target.centre_m)
-    return DepthRig(T_world_cam=simulation.T_world_cam, camera_data=data, bias=simulation.depth_bias, target_m=place)
+    return DepthRig(
+        T_world_cam=simulation.T_world_cam,
+        camera_data=data,
+        bias=simulation.depth_bias,
+        target_m=_target_m(simulation),
+    )
+
+
+def _target_m(simulation: Simulation) -> Array:
+    """The middle (3,) of the target at its first place, world [m]."""
+    return transform_points(simulation.T_world_target[0], simulation.target.centre_m)
 
 
 def measured_data(

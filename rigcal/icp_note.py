@@ -37,9 +37,21 @@ class Registration:
         return self.metrics.moved if self.metrics.success else []
 
     @property
+    def new_bias(self) -> dict[str, DepthBias]:
+        """The biases that go with the new poses: of the cameras that were moved, and of those they were moved against.
+
+        Where a pose was refused, the bias estimated beside it was refused with it.
+        """
+        if not self.moved:
+            return {}
+        stood = {name for name, move in self.metrics.cameras.items() if move.refusal == "reference"}
+        goes = {*self.moved, *stood, self.metrics.reference_camera}
+        return {name: bias for name, bias in sorted(self.metrics.biases.items()) if name in goes}
+
+    @property
     def bias(self) -> dict[str, DepthBias]:
         """Every camera's bias as it is known now."""
-        return {**self.given_bias, **(self.metrics.biases if self.metrics.success else {})}
+        return {**self.given_bias, **self.new_bias}
 
     @property
     def fact(self) -> str:
@@ -50,8 +62,8 @@ class Registration:
         return f"ICP refinement failed: {said}. Using ground-plane-only extrinsics."
 
     def covariance(self, levelled: Mapping[str, Array]) -> dict[str, Array]:
-        """(6, 6) of the new poses of the cameras that had one; where nothing moved, those stay."""
-        new = self.metrics.covariances if self.moved else {}
+        """(6, 6) of the poses of the cameras that had one: of clouds where they were moved, else as they were."""
+        new = {name: S for name, S in self.metrics.covariances.items() if name in self.moved}
         return {name: new.get(name, S) for name, S in levelled.items()}
 
 
@@ -61,9 +73,8 @@ def registered_content(
     """The content of a levelled file with what its clouds have told beyond poses and covariances."""
     meta = {**content["_meta"], "icp_refined": dict(note)}
     known = meta.get("depth_bias")
-    estimated = registration.metrics.biases if registration.metrics.success else {}
-    if estimated:
-        new = {name: bias.as_dict() for name, bias in sorted(estimated.items())}
+    new = {name: bias.as_dict() for name, bias in registration.new_bias.items()}
+    if new:
         meta["depth_bias"] = {**(known if isinstance(known, dict) else {}), **new}
     return {**content, "_meta": meta}
 
@@ -75,6 +86,9 @@ def icp_note(given: RigFile, source: DepthFile, registration: Registration) -> d
     return {
         "success": bool(metrics.success),
         "message": metrics.message,
+        "warnings": list(metrics.warnings),
+        "remarks": list(metrics.remarks),
+        "settled": bool(metrics.settled),
         "reference": metrics.reference_camera,
         "moved": registration.moved,
         "pairs_attempted": metrics.num_pairs_attempted,
@@ -85,7 +99,11 @@ def icp_note(given: RigFile, source: DepthFile, registration: Registration) -> d
         "pairs": [_pair(a, b, result) for (a, b), result in sorted(metrics.per_pair_results.items())],
         "depth_bias": {name: _bias(registration, name) for name in sorted(metrics.biases)},
         "covariance": {name: _numbers(S) for name, S in sorted(metrics.covariances.items())},
-        "floor": {"tilt_deg": _number(metrics.floor_tilt_deg), "rise_m": _number(metrics.floor_rise_m)},
+        "floor": {
+            "tilt_deg": _number(metrics.floor_tilt_deg),
+            "rise_m": _number(metrics.floor_rise_m),
+            "sigmas": _number(metrics.floor_sigmas),
+        },
         "provenance": {
             "rigcal": __version__,
             "options": {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(registration.config).items()},
@@ -106,6 +124,8 @@ def _camera(move: CameraMove, T_world_new_old: Pose) -> dict[str, Any]:
     return {
         "accepted": bool(move.accepted),
         "reason": move.reason,
+        "refusal": move.refusal or None,
+        "n_samples": int(move.n_samples),
         "T_world_new_old": pose_text(T_world_new_old),
         "rotation_deg": _number(move.rotation_deg),
         "translation_mm": _number(move.translation_mm),
@@ -121,6 +141,7 @@ def _pair(source: str, target: str, result: ICPResult) -> dict[str, Any]:
     return {
         "source": source,
         "target": target,
+        "overlaps": bool(result.overlaps),
         "converged": bool(result.converged),
         "verdict": result.verdict,
         "overlap_m2": _number(result.overlap_m2),
@@ -140,6 +161,7 @@ def _bias(registration: Registration, name: str) -> dict[str, Any]:
     return {
         "before": None if before is None else before.as_dict(),
         "after": registration.metrics.biases[name].as_dict(),
+        "written": name in registration.new_bias,
     }
 
 

@@ -26,17 +26,21 @@ _OPTIONS = (
                  help="After levelling, move cameras so that their clouds meet: each only as far as clouds know better "
                       "than its pose, and only where that proves true on points that were held out."),
     click.option("--icp-method", type=click.Choice(["point_to_plane", "gicp"]), default="point_to_plane",
-                 show_default=True, help="Distances to the other cloud's surface, or between both surfaces."),
+                 show_default=True,
+                 help="Distances along the normal of the other cloud's surface; or weighed by the covariances of both "
+                      "surfaces, which is not the GICP of Open3D."),
     click.option("--icp-voxel-size", type=Finite(0, 1, min_open=True), default=0.02, show_default=True,
-                 metavar="M", help="Clouds are thinned to one point in each cube of this size."),
+                 metavar="M", help="Clouds are thinned to one point in each cube of this size; for a scene on a desk "
+                                   "give less."),
     click.option("--icp-region", type=click.Choice(["floor", "hybrid", "full"]), default="hybrid", show_default=True,
                  help="What takes part: the floor and what lies just above it, that and whatever stands upright, or "
                       "everything."),
     click.option("--icp-depth-bias/--no-icp-depth-bias", default=True, show_default=True,
                  help="Estimate each camera's depth bias together with the poses, and write it."),
     click.option("--icp-global-init", is_flag=True,
-                 help="Also look for cameras that were bumped, by what their clouds look like; raise "
-                      "--max-rotation-deg and --max-translation-m to how far they may have gone."),
+                 help="Also look for cameras that were bumped, by what their clouds look like: up to 30 degrees and "
+                      "0.6 m from where they are said to stand, or as far as --max-rotation-deg and "
+                      "--max-translation-m allow if that is farther."),
 )  # fmt: skip
 _FLAGS = {
     "icp_method": "--icp-method",

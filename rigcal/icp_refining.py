@@ -1,4 +1,4 @@
-"""The story of registration: a levelled rig in, the same rig with clouds that meet out, or as it was, and why.
+"""The story of registration: a levelled rig in, the same rig with clouds that meet out, or as it was.
 
 Owns      what the registration is told of poses, who says how well they are known, what is said on the way.
 Leaves    registering to aruco.icp_registration, layouts to icp_note.
@@ -20,11 +20,11 @@ from rigcal.icp_note import Registration
 from rigcal.levelled_file import RigFile
 from rigcal.levelled_rig import Levelling
 
-__all__ = ["register_clouds"]
+__all__ = ["log_registration", "register_clouds"]
 
 
 def register_clouds(levelling: Levelling, config: ICPConfig) -> Levelling:
-    """The rig with its clouds registered; where that cannot be done, the levelled rig, and a warning.
+    """The rig with its clouds registered; where that cannot be done, the levelled rig, and why.
 
     Args:
         levelling: The rig on its floor.
@@ -40,8 +40,14 @@ def register_clouds(levelling: Levelling, config: ICPConfig) -> Levelling:
         metrics=metrics,
         given_bias={name: data["bias"] for name, data in levelling.data.items() if "bias" in data},
     )
-    (logger.info if metrics.success else logger.warning)("{}", registration.fact)
     return replace(levelling, registration=registration)
+
+
+def log_registration(found: Registration) -> None:
+    """Say what became of the rig, and what wants to be done about it: at the end, where it is read."""
+    (logger.info if found.metrics.success else logger.warning)("{}", found.fact)
+    for warning in found.metrics.warnings:
+        logger.warning("{}", warning)
 
 
 def _warn_of_input(given: RigFile, digest: str) -> None:
@@ -64,6 +70,7 @@ def _registered(levelling: Levelling, config: ICPConfig) -> tuple[dict[str, Pose
             config,
             covariances=_known(levelling),
             priors=levelling.T_before_cam,
+            start_covariances=levelling.covariance,
         )
     except RigError as error:
         return start, ICPMetrics(success=False, message=str(error))

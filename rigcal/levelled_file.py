@@ -71,8 +71,8 @@ class RigFile:
 
     @property
     def registered_with(self) -> str | None:
-        """SHA-256 of the depth whose clouds were registered before."""
-        if self._told("icp_refined", "success") is not True:
+        """SHA-256 of the depth whose clouds have moved cameras before."""
+        if self._told("icp_refined", "success") is not True or not self._told("icp_refined", "moved"):
             return None
         return self._told("icp_refined", "provenance", "inputs_sha256", "depth")
 

@@ -42,7 +42,8 @@ class Levelling:
     def partial(self) -> dict[str, str]:
         """Cameras that were moved with the whole rig only, or not at all, and why."""
         why = {name: reason for name, reason in self.metrics.without_floor.items() if name in self.data}
-        why |= dict.fromkeys(self.given.T_world_cam.keys() - self.data.keys(), "it has no depth in the store")
+        unseen = self.given.T_world_cam.keys() - self.data.keys()
+        why |= dict.fromkeys(unseen, "it has no depth in the store, or an image without any measurement")
         why |= {name: c.reason for name, c in self.metrics.corrections.items() if not c.accepted}
         why |= dict.fromkeys(self.given.apart, "it stands in a world of its own (_meta.parts), which stays as it was")
         return dict(sorted(why.items()))
@@ -138,16 +139,17 @@ class Levelling:
         found = self.registration
         if found is None or not found.metrics.success:
             return ()
-        return tuple(
-            cloud_view(
-                name,
-                self._trusted(name, found.given_bias.get(name)),
-                self._trusted(name, found.bias.get(name)),
-                np.asarray(self.data[name]["K"], dtype=np.float64),
-                T_before_cam=found.T_start_cam[name],
-                T_after_cam=found.T_world_cam[name],
-            )
-            for name in sorted(self.data)
+        return tuple(self._cloud(name, found) for name in sorted(self.data))
+
+    def _cloud(self, camera: str, found: Registration) -> CloudView:
+        trusted, old, new = self._trusted(camera), found.given_bias.get(camera), found.bias.get(camera)
+        return cloud_view(
+            camera,
+            _without(old, trusted),
+            _without(new, trusted),
+            np.asarray(self.data[camera]["K"], dtype=np.float64),
+            T_before_cam=found.T_start_cam[camera],
+            T_after_cam=found.T_world_cam[camera],
         )
 
     def _view(self, camera: str, T_before_cam: Pose) -> FloorView:
@@ -155,7 +157,7 @@ class Levelling:
         focal_baseline = self._focal_baseline(camera)
         return floor_view(
             camera,
-            self._trusted(camera, data.get("bias")),
+            _without(data.get("bias"), self._trusted(camera)),
             np.asarray(data["K"], dtype=np.float64),
             T_before_cam=T_before_cam,
             T_after_cam=self.T_world_cam[camera],
@@ -163,12 +165,16 @@ class Levelling:
             sigma_m=lambda z: DepthNoise(focal_baseline=focal_baseline).averaged_sigma_m(z, data["n_frames"]),
         )
 
-    def _trusted(self, camera: str, bias: DepthBias | None) -> Array:
-        """A camera's depth (H, W) [m] without a bias, NaN beside edges."""
+    def _trusted(self, camera: str) -> Array:
+        """A camera's depth (H, W) [m] as it was measured, NaN beside edges."""
         depth, K = self.data[camera]["depth"], np.asarray(self.data[camera]["K"], dtype=np.float64)
         wrong = mask_edges(depth, focal_baseline=self._focal_baseline(camera), focal_px=float(K[0, 0]))
-        return np.where(wrong, np.nan, depth if bias is None else bias.corrected(depth))
+        return np.where(wrong, np.nan, depth)
 
     def _focal_baseline(self, camera: str) -> float | None:
         data = self.data[camera]
         return float(data["K"][0][0]) * data["baseline"] if data["baseline"] else None
+
+
+def _without(bias: DepthBias | None, depth: Array) -> Array:
+    return depth if bias is None else bias.corrected(depth)

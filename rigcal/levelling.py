@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from loguru import logger
 
-from aruco.depth_image import check_depth
 from aruco.depth_save import CameraDepth, load_depth_data
 from aruco.errors import CalibrationError, InputError
 from aruco.ground_plane import GroundPlaneConfig, GroundPlaneMetrics, refine_ground_from_depth
@@ -39,7 +39,7 @@ def level_files(extrinsics: Path, depth: Path, config: GroundPlaneConfig) -> Lev
         InputError: A file cannot be used as it is.
         CalibrationError: There is no floor, or floor, cameras and world contradict each other.
     """
-    given, store = rig_file(extrinsics), load_depth_data(depth, frames=False)
+    given, store = rig_file(extrinsics), load_depth_data(depth, frames=False, blind=True)
     source = depth_file(depth)
     data = _camera_data(given, store, depth)
     _warn_of_input(given, store, source)
@@ -56,7 +56,7 @@ def _camera_data(given: RigFile, store: Mapping[str, CameraDepth], path: Path) -
     """The depth of cameras that have a pose, with their biases, by name.
 
     Raises:
-        InputError: There is none, or a depth image is none.
+        InputError: There is none, or nothing in it.
     """
     both = sorted(given.T_world_cam.keys() & store.keys())
     if not both:
@@ -64,9 +64,11 @@ def _camera_data(given: RigFile, store: Mapping[str, CameraDepth], path: Path) -
             f"{path}: has depth of {', '.join(sorted(store)) or 'no camera'}, but none of the cameras of {given.name} "
             f"({', '.join(sorted(given.T_world_cam))}); give the depth of the same rig."
         )
-    data = {name: store[name].as_camera_data() for name in both}
-    for name in both:
-        data[name]["depth"] = check_depth(store[name].depth, f"{path}: camera {name}")
+    seeing = [name for name in both if np.isfinite(store[name].depth).any()]
+    if not seeing:
+        load_depth_data(path, frames=False)  # says what they are full of
+    data = {name: store[name].as_camera_data() for name in seeing}
+    for name in seeing:
         if name in given.depth_bias:
             data[name]["bias"] = given.depth_bias[name]
     return data
@@ -80,6 +82,11 @@ def _warn_of_input(given: RigFile, store: Mapping[str, CameraDepth], source: Dep
         logger.warning("{} was levelled with this depth before; its covariances count the same floor twice", given.name)
     if given.apart:
         logger.warning("cameras {} stand in worlds of their own (_meta.parts), and stay there", ", ".join(given.apart))
+    blind = sorted(n for n in store.keys() & given.T_world_cam.keys() if not np.isfinite(store[n].depth).any())
+    if blind:
+        logger.warning(
+            "depth of cameras {} holds no measurement; they are moved with the whole rig only", ", ".join(blind)
+        )
     unknown = sorted(store.keys() - given.T_world_cam.keys() - set(given.apart))
     if unknown:
         logger.warning("depth of cameras {} is not used: {} has no pose of them", ", ".join(unknown), given.name)

@@ -95,6 +95,7 @@ def _page(levelling: Levelling) -> str:
     world = {"up_y": levelling.up_y, "floor_y": levelling.floor_y}
     found, more = levelling.registration, ()
     if found is not None:
-        sheets = sheets_of(found.metrics, levelling.T_world_cam.keys(), found.given_bias)
-        more = icp_section(levelling.clouds(), sheets, remarks_of(found.metrics), found.fact, **world)
+        sheets = sheets_of(found.metrics, levelling.T_world_cam.keys(), found.given_bias, found.new_bias.keys())
+        facts = (found.fact, *found.metrics.warnings)
+        more = icp_section(levelling.clouds(), sheets, remarks_of(found.metrics), facts, **world)
     return floor_page(levelling.views(), levelling.figures, levelling.facts, **world, more=more)

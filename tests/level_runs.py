@@ -13,6 +13,7 @@ from click.testing import CliRunner, Result
 from floor_rooms import cameras, nudged
 
 from aruco.depth_save import CameraDepth, save_depth_data
+from aruco.floor_model import centre_jacobian
 from aruco.pose_math import Pose, exp_so3, make_pose, pose_text
 from refine_ground_plane import main
 
@@ -50,9 +51,7 @@ def document(T_world_cam: Mapping[str, Pose], at_centre: np.ndarray = ROUGH_COVA
 
 def at(T_world_cam: Pose, at_centre: np.ndarray = ROUGH_COVARIANCE) -> np.ndarray:
     """A covariance of turn and centre as one of the left perturbation in the world's axes."""
-    J = np.eye(6)
-    c = T_world_cam[:3, 3]
-    J[3:, :3] = [[0, c[2], -c[1]], [-c[2], 0, c[0]], [c[1], -c[0], 0]]  # v = shift of the centre - omega x c
+    J = centre_jacobian(T_world_cam[:3, 3], inverse=True)
     return J @ at_centre @ J.T
 
 
@@ -112,7 +111,7 @@ def failed(rig: Path, store: Path, folder: Path, *words: str, more: tuple[object
     note = content["_meta"]["icp_refined"]
     assert note["success"] is False
     assert note["moved"] == []
-    assert re.search(r"ICP refinement failed: .*[^.]\. Using ground-plane-only extrinsics\.", said), said
+    assert len(re.findall(r"ICP refinement failed: .*?[^.]\. Using ground-plane-only extrinsics\.", said)) == 1, said
     assert "Traceback" not in said
     for word in words:
         assert word in note["message"], note["message"]

@@ -16,6 +16,8 @@ from click.testing import CliRunner
 from aruco.model import Camera
 from benchmarks import baseline, run
 from benchmarks.child import run_child
+from benchmarks.furnished_rooms import FARTHEST_M, NEAREST_M, things_amid_cameras
+from benchmarks.icp_outcomes import Outcome, Room
 from benchmarks.metric import Better, Metric, Skipped, faults
 from benchmarks.tag_wall import TagWall, corner_errors
 from benchmarks.tone_curve import srgb
@@ -236,3 +238,27 @@ def test_the_tone_curve_keeps_its_ends_and_lifts_what_is_dark() -> None:
     # 0.214 of the light is the middle of the sRGB scale.
     levels = srgb(np.array([0.0, 0.21404 * 255, 255.0], dtype=np.float32))
     np.testing.assert_allclose(levels, [0.0, 127.5, 255.0], atol=0.01)  # five digits of 0.21404
+
+
+def test_things_stand_on_the_floor_around_the_target_and_repeat() -> None:
+    target_m = np.array([0.7, 0.4, -0.3])
+    panels = things_amid_cameras(target_m, np.random.default_rng(5))
+    corners = np.concatenate([panel.vertices for panel in panels])
+    assert corners[:, 1].min() == pytest.approx(0.0, abs=1e-9)
+    away = np.linalg.norm(corners[:, [0, 2]] - target_m[[0, 2]], axis=1)
+    # A table is 1 m by 0.7 m at most: its corners are 0.61 m from its middle.
+    assert away.max() < FARTHEST_M + 0.62
+    assert np.median(away) > NEAREST_M
+    again = things_amid_cameras(target_m, np.random.default_rng(5))
+    assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(panels, again))
+
+
+def test_harm_is_five_percent_or_a_millimetre_whichever_is_larger() -> None:
+    room = Room(seed=0, furnished=True)
+    rough = Outcome(room=room, start="rough", biased=True, before_mm=40.0, after_mm={"a": 42.0, "b": 30.0})
+    good = Outcome(room=room, start="good", biased=True, before_mm=5.0, levelled_mm={"a": 4.0}, after_mm={"a": 5.5})
+    assert rough.growth("a") == pytest.approx(1.0)
+    assert rough.growth("b") == pytest.approx(-5.0)
+    assert good.growth("a") == pytest.approx(0.5)
+    assert good.growth_by_icp("a") == pytest.approx(1.5)
+    assert good.ratio_by_icp("a") == pytest.approx(1.375)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,11 @@ import pytest
 from floor_rooms import BASELINE_M, ROOM, cameras, depth_image, zoomed
 from icp_rooms import box, clouds_of
 
-from aruco import icp_bumped, icp_registration
+from aruco import icp_bumped, icp_looking
 from aruco.floor_model import centre_jacobian
 from aruco.floor_plane import FloorPlane
-from aruco.icp_bumped import Answer, believed, found_elsewhere, found_prior
+from aruco.icp_bumped import Answer, found_prior, looked_for
+from aruco.icp_looking import Looked
 from aruco.icp_registration import refine_with_icp
 from aruco.icp_solve import Prior, register
 from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics
@@ -24,8 +24,8 @@ from aruco.pose_math import Array, Pose, exp_so3, make_pose, pose_distance
 
 UP = np.array([0.0, 1.0, 0.0])
 PLANE = FloorPlane(normal=UP, d=0.0)
-BUMP_DEG, BUMP_M = 8.0, 0.25
-RAISED = ICPConfig(global_init=True, max_rotation_deg=15.0, max_translation_m=0.5)
+BUMP_DEG, BUMP_M = 20.0, 0.4
+LOOKING = ICPConfig(global_init=True)
 # What is asked of a bumped camera that is moved back.
 BACK_DEG, BACK_MM = 0.3, 10.0
 
@@ -93,46 +93,55 @@ def furnished() -> Furnished:
 def test_a_bumped_camera_comes_back(furnished: Furnished) -> None:
     truth = furnished.truth
     start = {**truth, "cam1": _bumped(truth["cam1"], np.array([0.3, 1.0, -0.2]))}
-    poses, metrics = furnished.refined(start, RAISED)
+    poses, metrics = furnished.refined(start, LOOKING)
     degrees, mm = _errors(poses["cam1"], truth["cam1"])
     assert degrees < BACK_DEG
     assert mm < BACK_MM
-    assert metrics.cameras["cam1"].accepted
-    assert "its surroundings place it" in metrics.cameras["cam1"].reason
-    assert "Found elsewhere than they were said to stand, and moved there: cam1." in metrics.message
+    move = metrics.cameras["cam1"]
+    assert move.accepted
+    assert "its surroundings place it" in move.reason
+    # Told is the way from where it was said to stand.
+    assert move.rotation_deg == pytest.approx(BUMP_DEG, abs=BACK_DEG)
+    assert move.translation_mm == pytest.approx(1e3 * BUMP_M, abs=BACK_MM)
+    assert "Found elsewhere than they were said to stand, and moved there: cam1 (by " in metrics.message
     # The others stood well, and do.
     for name in truth.keys() - {"cam1"}:
         assert _errors(poses[name], truth[name])[1] < 2.0
     # Clouds alone do not bring it back, however far it may be moved: what is known of its given pose forbids it.
-    missed, _ = furnished.refined(start, replace(RAISED, global_init=False))
+    far = ICPConfig(max_rotation_deg=40.0, max_translation_m=1.0)
+    missed, _ = furnished.refined(start, far)
     degrees, mm = _errors(missed["cam1"], truth["cam1"])
     assert degrees > BACK_DEG
     assert mm > BACK_MM
 
 
-def test_a_bumped_camera_stays_where_bounds_do_not_reach(furnished: Furnished) -> None:
+def test_a_bumped_reference_is_named_and_nobody_is_moved_for_it(furnished: Furnished) -> None:
     truth = furnished.truth
-    start = {**truth, "cam1": _bumped(truth["cam1"])}
-    poses, metrics = furnished.refined(start, ICPConfig(global_init=True))
-    np.testing.assert_array_equal(poses["cam1"], start["cam1"])
-    assert not metrics.cameras["cam1"].accepted
-    assert "elsewhere" not in metrics.message
+    start = {**truth, "cam0": _bumped(truth["cam0"])}
+    poses, metrics = furnished.refined(start, LOOKING)
+    assert "The reference, cam0, contradicts the others" in metrics.message
+    reason = metrics.cameras["cam0"].reason
+    assert "those of cam1, cam2, which agree among themselves, and they place it 2" in reason
+    assert "calibrate it again, or rename it" in reason
+    for name, T in start.items():
+        assert _errors(poses[name], T)[1] < BACK_MM
+        assert _errors(poses[name], T)[0] < BACK_DEG
 
 
 def test_nothing_changes_where_nobody_was_bumped(furnished: Furnished, monkeypatch: pytest.MonkeyPatch) -> None:
     turn = exp_so3(np.array([0.0, 0.004, 0.0]))
     start = {n: make_pose(turn @ T[:3, :3], T[:3, 3]) if n == "cam2" else T for n, T in furnished.truth.items()}
-    poses, metrics = furnished.refined(start, RAISED)
-    plain, plain_metrics = furnished.refined(start, replace(RAISED, global_init=False))
+    poses, metrics = furnished.refined(start, LOOKING)
+    plain, plain_metrics = furnished.refined(start, ICPConfig())
     for name, T in plain.items():
         assert poses[name].tobytes() == T.tobytes()
         assert metrics.cameras[name].reason == plain_metrics.cameras[name].reason
         assert metrics.covariances[name].tobytes() == plain_metrics.covariances[name].tobytes()
     assert metrics.message == plain_metrics.message
-    # Nor by a wrong proposal, which clouds refuse.
+    # Nor by a wrong proposal, which is refused.
     wrong = make_pose(start["cam2"][:3, :3], start["cam2"][:3, 3] + [0.25, 0.0, 0.25])
-    monkeypatch.setattr(icp_registration, "found_elsewhere", lambda *_: {"cam2": wrong})
-    poses, metrics = furnished.refined(start, RAISED)
+    monkeypatch.setattr(icp_bumped, "looked_at", lambda *_: Looked(found={"cam2": wrong}))
+    poses, metrics = furnished.refined(start, LOOKING)
     for name, T in plain.items():
         assert poses[name].tobytes() == T.tobytes()
     assert "A place 0.00 degrees and 353.6 mm from where it was said to stand" in metrics.cameras["cam2"].reason
@@ -142,44 +151,108 @@ def test_nothing_changes_where_nobody_was_bumped(furnished: Furnished, monkeypat
 # ------------------------------------------------------------------------------------------------- who is looked for
 
 
-def _proposing(monkeypatch: pytest.MonkeyPatch, wrong: set[str], blamed: dict[str, str]) -> list[tuple[str, set[str]]]:
-    """Lets wrong cameras be found, and blamed ones as long as another is there; answers what is asked."""
-    asked: list[tuple[str, set[str]]] = []
+def _refined_as_given(poses: Mapping[str, Pose]) -> Any:
+    def refined(elsewhere: Mapping[str, Pose]) -> Answer:
+        return _answer({**poses, **elsewhere}, {*elsewhere})
 
-    def start(source: Any, targets: Any, T_world_cam: Any, config: ICPConfig) -> Pose | None:
-        assert config.region == "full"
-        names = {target.camera for target in targets}
-        asked.append((source.camera, names))
-        found = source.camera in wrong or blamed.get(source.camera) in names
-        return _places(1.0)[0] if found else None
-
-    monkeypatch.setattr(icp_bumped, "global_start", start)
-    monkeypatch.setattr(icp_bumped, "cloud_of", lambda name, *_, **__: SimpleNamespace(camera=name))
-    return asked
+    return refined
 
 
-def test_the_reference_is_not_looked_for_and_all_others_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = _proposing(monkeypatch, {"cam0", "cam2"}, {})
-    truth = cameras(4)
-    found = found_elsewhere({name: {} for name in truth}, truth, PLANE, {}, ICPConfig())
-    assert list(found) == ["cam2"]
-    assert asked == [(name, {*truth}) for name in ("cam1", "cam2", "cam3")]
+def _searched(
+    monkeypatch: pytest.MonkeyPatch, furnished: Furnished, start: Mapping[str, Pose], found: Mapping[str, Pose]
+) -> tuple[Answer, list[tuple[str, list[str]]]]:
+    """The answer where registration believes everything, and who was looked for among whom."""
+    asked: list[tuple[str, list[str]]] = []
+
+    def fake(source: Any, targets: Any, T_world_cam: Any, config: ICPConfig) -> Pose | None:
+        assert config.max_rotation_deg >= icp_looking.LOOK_DEG
+        asked.append((source.camera, [target.camera for target in targets]))
+        return found.get(source.camera)
+
+    monkeypatch.setattr(icp_looking, "global_start", fake)
+    data = {name: furnished.data[name] for name in start}
+    return looked_for(data, start, {}, PLANE, {}, LOOKING, _refined_as_given(start)), asked
 
 
-def test_who_only_seems_bumped_beside_a_bumped_one_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = _proposing(monkeypatch, {"cam2"}, {"cam3": "cam2"})
-    truth = cameras(4)
-    found = found_elsewhere({name: {} for name in truth}, truth, PLANE, {}, ICPConfig())
-    assert list(found) == ["cam2"]
-    assert asked[3:] == [("cam2", {"cam0", "cam1", "cam2"}), ("cam3", {"cam0", "cam1", "cam3"})]
+def test_only_cameras_that_look_bumped_are_looked_for(monkeypatch: pytest.MonkeyPatch, furnished: Furnished) -> None:
+    start = {**furnished.truth, "cam2": _bumped(furnished.truth["cam2"])}
+    (poses, _), asked = _searched(monkeypatch, furnished, start, furnished.truth)
+    assert asked == [("cam2", ["cam0", "cam1"])]
+    np.testing.assert_array_equal(poses["cam2"], furnished.truth["cam2"])
+    _, asked = _searched(monkeypatch, furnished, furnished.truth, {})
+    assert asked == []
+
+
+def test_of_two_cameras_the_other_one_is_looked_for(monkeypatch: pytest.MonkeyPatch, furnished: Furnished) -> None:
+    truth = furnished.truth
+    start = {"cam0": _bumped(truth["cam0"]), "cam1": truth["cam1"]}
+    (_, metrics), asked = _searched(monkeypatch, furnished, start, {})
+    assert asked == [("cam1", ["cam0"])]
+    assert "Its cloud contradicts that of cam0, and within 30 degrees and 0.6 m" in metrics.cameras["cam1"].reason
+    assert metrics.message.endswith("Not where they are said to stand, and found nowhere else: cam1.")
+
+
+def test_a_place_where_clouds_contradict_each_other_is_refused(
+    monkeypatch: pytest.MonkeyPatch, furnished: Furnished
+) -> None:
+    truth = furnished.truth
+    start = {**truth, "cam2": _bumped(truth["cam2"])}
+    # Whatever registration believes: the place is 8 cm and 2 degrees off.
+    near = make_pose(exp_so3(math.radians(2.0) * UP) @ truth["cam2"][:3, :3], truth["cam2"][:3, 3] + [0.06, 0.0, 0.05])
+    (poses, metrics), _ = _searched(monkeypatch, furnished, start, {"cam2": near})
+    np.testing.assert_array_equal(poses["cam2"], start["cam2"])
+    assert "of what could meet other clouds contradicts them" in metrics.cameras["cam2"].reason
+    (poses, _), _ = _searched(monkeypatch, furnished, start, truth)
+    np.testing.assert_array_equal(poses["cam2"], truth["cam2"])
+
+
+def _contradicting(poses: Mapping[str, Pose], away: set[str]) -> Any:
+    """Registration that believes all but that some stand where they are said to."""
+
+    def refined(elsewhere: Mapping[str, Pose]) -> Answer:
+        out, metrics = _answer({**poses, **elsewhere}, {*elsewhere})
+        cameras = {
+            name: replace(move, refusal="prior") if name in away - {*elsewhere} else move
+            for name, move in metrics.cameras.items()
+        }
+        return out, replace(metrics, cameras=cameras)
+
+    return refined
+
+
+def test_who_contradicts_its_pose_only_by_the_estimate_is_looked_for_too(
+    monkeypatch: pytest.MonkeyPatch, furnished: Furnished
+) -> None:
+    asked: list[str] = []
+
+    def fake(source: Any, targets: Any, T_world_cam: Any, config: ICPConfig) -> Pose:
+        asked.append(source.camera)
+        return truth[source.camera]
+
+    monkeypatch.setattr(icp_looking, "global_start", fake)
+    truth = furnished.truth
+    start = {**truth, "cam2": make_pose(truth["cam2"][:3, :3], truth["cam2"][:3, 3] + [0.03, 0.0, 0.0])}
+    by = _contradicting(start, {"cam2"})
+    poses, metrics = looked_for(furnished.data, start, {}, PLANE, {}, LOOKING, by)
+    assert asked == ["cam2"]
+    np.testing.assert_array_equal(poses["cam2"], truth["cam2"])
+    assert metrics.message.endswith("moved there: cam2 (by 0.00 degrees and 30.0 mm).")
+    # Where all others do, it is the reference.
+    by = _contradicting(start, {"cam1", "cam2"})
+    poses, metrics = looked_for(furnished.data, start, {}, PLANE, {}, LOOKING, by)
+    np.testing.assert_array_equal(poses["cam2"], start["cam2"])
+    assert "The reference, cam0, contradicts the others" in metrics.message
+    assert "contradicts those of cam1, cam2" in metrics.cameras["cam0"].reason
 
 
 def test_nobody_is_found_without_depth() -> None:
     truth = cameras(2)
-    assert found_elsewhere({}, truth, None, {}, ICPConfig()) == {}
-    assert found_elsewhere({}, {}, None, {}, ICPConfig()) == {}
-    useless = {name: {"depth": np.zeros((3,)), "K": np.eye(3)} for name in truth}
-    assert found_elsewhere(useless, truth, None, {}, ICPConfig()) == {}
+    for data in ({}, {name: {"depth": np.zeros((3,)), "K": np.eye(3)} for name in truth}):
+        poses, metrics = looked_for(data, truth, {}, None, {}, LOOKING, _refined_as_given(truth))
+        assert metrics.message == "All is done."
+        assert poses.keys() == truth.keys()
+    _, metrics = looked_for({}, {}, {}, None, {}, LOOKING, _refined_as_given({}))
+    assert metrics.message == "All is done."
 
 
 def test_a_found_place_is_known_to_degrees_and_decimetres_at_the_camera() -> None:
@@ -201,7 +274,12 @@ def _answer(poses: Mapping[str, Pose], accepted: set[str], reason: str = "It kee
     return dict(poses), ICPMetrics(success=True, message="All is done.", cameras=moves)
 
 
-def test_a_refused_place_leaves_no_trace() -> None:
+def _believing(monkeypatch: pytest.MonkeyPatch, given: Mapping[str, Pose], found: dict[str, Pose], by: Any) -> Answer:
+    monkeypatch.setattr(icp_bumped, "looked_at", lambda *_: Looked(found=found))
+    return looked_for({}, given, {}, None, {}, LOOKING, by)
+
+
+def test_a_refused_place_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
     given = dict(zip("abc", _places(0.0, 1.0, 2.0)))
     found = dict(zip("bc", _places(1.5, 2.5)))
     asked: list[list[str]] = []
@@ -212,13 +290,13 @@ def test_a_refused_place_leaves_no_trace() -> None:
         pulled = _places(0.2)[0] if "b" in elsewhere else given["a"]
         return _answer({**given, "a": pulled, "c": elsewhere["c"]}, {"a", "c"})
 
-    poses, metrics = believed(given, found, refined)
+    poses, metrics = _believing(monkeypatch, given, found, refined)
     assert asked == [["b", "c"], ["c"]]
     np.testing.assert_array_equal(poses["a"], given["a"])
     np.testing.assert_array_equal(poses["b"], given["b"])
     np.testing.assert_array_equal(poses["c"], found["c"])
     assert metrics.message == (
-        "All is done. Found elsewhere than they were said to stand, and moved there: c. "
+        "All is done. Found elsewhere than they were said to stand, and moved there: c (by 0.00 degrees and 500.0 mm). "
         "Found elsewhere, but kept where they were said to stand: b."
     )
     reason = metrics.cameras["b"].reason
@@ -227,7 +305,20 @@ def test_a_refused_place_leaves_no_trace() -> None:
     assert metrics.cameras["a"].reason == "It keeps its pose: why."
 
 
-def test_a_place_from_which_nothing_can_be_done_is_refused() -> None:
+def test_a_place_that_clouds_do_not_tell_in_every_direction_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = dict(zip("ab", _places(0.0, 1.0)))
+
+    def refined(elsewhere: Mapping[str, Pose]) -> Answer:
+        poses, metrics = _answer({**given, **elsewhere}, {*elsewhere})
+        cameras = {name: replace(move, unobservable=("shift along x",)) for name, move in metrics.cameras.items()}
+        return poses, replace(metrics, cameras=cameras)
+
+    poses, metrics = _believing(monkeypatch, given, {"b": _places(1.5)[0]}, refined)
+    np.testing.assert_array_equal(poses["b"], given["b"])
+    assert "do not tell its shift along x" in metrics.cameras["b"].reason
+
+
+def test_a_place_from_which_nothing_can_be_done_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     given = dict(zip("ab", _places(0.0, 1.0)))
 
     def refined(elsewhere: Mapping[str, Pose]) -> Answer:
@@ -235,18 +326,10 @@ def test_a_place_from_which_nothing_can_be_done_is_refused() -> None:
             return dict(given), ICPMetrics(success=False, message="No clouds overlap.")
         return _answer(given, set())
 
-    poses, metrics = believed(given, {"b": _places(9.0)[0]}, refined)
+    poses, metrics = _believing(monkeypatch, given, {"b": _places(9.0)[0]}, refined)
     assert metrics.success
     np.testing.assert_array_equal(poses["b"], given["b"])
     assert 'was refused ("No clouds overlap.")' in metrics.cameras["b"].reason
-
-
-def test_without_proposals_the_answer_is_as_it_was() -> None:
-    given = dict(zip("ab", _places(0.0, 1.0)))
-    answer = _answer(given, {"b"})
-    _, metrics = believed(given, {}, lambda _: answer)
-    assert metrics.message == answer[1].message
-    assert metrics.cameras == answer[1].cameras
 
 
 # ------------------------------------------------------------------------------------------ where an estimate begins

@@ -110,6 +110,10 @@ def test_errors_are_as_large_as_promised(trials: list[Registration]):
     assert max(values) < 3.0
 
 
+def test_noise_as_promised_is_taken_as_promised(trials: list[Registration]):
+    assert {found.scale for found in trials} == {1.0}
+
+
 def test_samples_counted_as_independent_promise_too_much(trials: list[Registration]):
     """The same rows, every sample with an error of its own: what a plain point-to-plane information matrix says."""
     values = []

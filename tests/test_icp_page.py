@@ -105,9 +105,10 @@ def test_the_buttons_show_one_or_the_other() -> None:
 
 
 def test_nothing_registered_has_a_sentence_and_no_pictures() -> None:
-    pieces = icp_section((), (), (), "ICP refinement failed: no overlap.", up_y=1, floor_y=0.0)
-    assert len(pieces) == 1
-    assert "no overlap" in pieces[0]
+    pieces = icp_section((), (), (), ("ICP refinement failed: no overlap.", "Look <here>."), up_y=1, floor_y=0.0)
+    assert len(pieces) == 3
+    assert "no overlap" in pieces[1]
+    assert pieces[2] == "<p>Look &lt;here&gt;.</p>"
 
 
 def test_biases_are_told_in_their_own_units() -> None:
@@ -117,12 +118,27 @@ def test_biases_are_told_in_their_own_units() -> None:
         "c": DepthBias(inverse_depth=0.002),
     }
     metrics = ICPMetrics(success=True, biases=biases)
-    (sheet,) = sheets_of(metrics, ("a", "b", "c"), {"a": DepthBias(scale=-0.001), "b": DepthBias(scale=0.001)})
+    (sheet,) = sheets_of(metrics, ("a", "b", "c"), {"a": DepthBias(scale=-0.001), "b": DepthBias(scale=0.001)}, "a")
     rows = {row[0]: row[1:] for row in sheet.rows}
-    assert rows["a"] == ("-0.10", "+0.20", "-", "0.00 px", "+0.10 px", "-")
+    assert rows["a"] == ("-0.10", "+0.20", "-", "0.00 px", "+0.10 px", "-", "yes")
     # What was a stereo camera's bias is no offset.
-    assert rows["b"] == ("+0.10", "0.00", "0.10", "-", "+3.00 mm", "1.00 mm")
+    assert rows["b"] == ("+0.10", "0.00", "0.10", "-", "+3.00 mm", "1.00 mm", "no, pose kept")
     assert rows["c"][4] == "+2.00 /km"
+
+
+def test_pairs_of_many_cameras_are_listed_where_they_overlap_and_counted_where_not() -> None:
+    meets = ICPResult(np.eye(4), 0.5, 0.01, np.eye(6), converged=True)
+    apart = ICPResult(np.eye(4), 0.0, np.nan, np.zeros((6, 6)), converged=False, overlap_m2=0.0, overlaps=False)
+    few = {("a", "b"): meets, ("a", "c"): apart, ("b", "c"): apart}
+    (pairs,) = sheets_of(ICPMetrics(True, per_pair_results=few), "abc", {})
+    assert [row[:2] for row in pairs.rows] == [("a", "b"), ("a", "c"), ("b", "c")]
+    assert pairs.rows[1][2:] == ("0.00", "-", "-", "-", "-", "-", "-", "do not overlap")
+    assert "do not overlap" not in pairs.legend
+    names = [f"{k:02d}" for k in range(20)]
+    many = {(a, b): meets if int(b) == int(a) + 1 else apart for a in names for b in names if a < b}
+    (pairs,) = sheets_of(ICPMetrics(True, per_pair_results=many), names, {})
+    assert len(pairs.rows) == 19
+    assert "171 more pairs of clouds do not overlap." in pairs.legend
 
 
 def test_outcomes_and_remarks() -> None:
@@ -142,5 +158,5 @@ def test_outcomes_and_remarks() -> None:
         "camera c: its cloud overlaps no other",
     )
     assert '<td class="w">took no part</td>' in sheet_table(sheet)
-    pieces = icp_section((), (sheet,), remarks_of(metrics), "done", up_y=1, floor_y=0.0)
+    pieces = icp_section((), (sheet,), remarks_of(metrics), ("done",), up_y=1, floor_y=0.0)
     assert "it &lt;fits&gt; &amp; more" in "".join(pieces)

@@ -385,6 +385,13 @@ def test_build_pose_graph_refuses_cameras_without_poses() -> None:
         build_pose_graph(["a"], {"a": np.eye(4), "z": np.eye(4)}, {}, "z")
 
 
+@pytest.mark.parametrize("information", [np.eye(3), np.full((6, 6), np.nan)])
+def test_build_pose_graph_refuses_information_that_is_none(information: Array) -> None:
+    pair = _result(np.eye(4), information=information)
+    with pytest.raises(InputError, match=r"pair a, b: its information is no \(6, 6\)"):
+        build_pose_graph(["a", "b"], {"a": np.eye(4), "b": np.eye(4)}, {("a", "b"): pair}, "a")
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.permutations(["a", "b", "c"]), st.lists(st.booleans(), min_size=3, max_size=3))
 def test_optimizing_recovers_a_known_graph_of_three(seed: int, order: list[str], turned: list[bool]) -> None:

@@ -15,14 +15,15 @@ from icp_rooms import LEVEL, box
 from aruco.floor_model import centre_jacobian
 from aruco.floor_plane import FloorPlane
 from aruco.icp_cloud import Cloud, cloud_of
-from aruco.icp_equations import State, floor_parameters, floor_rows, joined, pair_rows
+from aruco.icp_equations import LEAST_SCALE, State, floor_parameters, floor_rows, joined, pair_rows, residual_scale
 from aruco.icp_match import Matches, match, overlapping_pairs
 from aruco.icp_normal import summed
+from aruco.icp_prior import ASPECTS, default_of
 from aruco.icp_rows import Layout, Rows
 from aruco.icp_smooth import smoothed
 from aruco.icp_solve import Prior, Registration, register
 from aruco.icp_types import ICPConfig
-from aruco.pose_math import Array, Pose, adjoint, exp_so3, invert_transform, log_so3, make_pose, pose_distance
+from aruco.pose_math import Array, Pose, adjoint, exp_se3, exp_so3, invert_transform, log_so3, make_pose, pose_distance
 
 RIG = cameras()
 ZOOM = 2  # 640 x 360: cells of 28 px are a few centimetres
@@ -203,6 +204,15 @@ def unobserved_pairs(found: Registration) -> list[tuple[str, ...]]:
     return [pair.unobservable for pair in found.pairs.values()]
 
 
+def test_a_bare_floor_says_nothing_of_depth_errors_either():
+    """A plane that a depth error moves a turn and a rise move back: only priors may tell them apart."""
+    found = registered(seen((FLOOR,)), off(ROUGH, 1), ROUGH)
+    for name, bias in found.bias.items():
+        sigma = np.sqrt(np.diag(seen()[name].bias_covariance))
+        # Taken a centimetre apart, derivatives by both told them to 1 sigma, and noise made that 8.
+        assert (np.abs(bias) < 0.5 * sigma).all()
+
+
 def test_information_of_a_bare_floor_knows_tilt_and_height_alone():
     found = registered(seen((FLOOR,)), RIG, ROUGH)
     for (_, target), pair in found.pairs.items():
@@ -233,13 +243,54 @@ def test_depth_errors_are_estimated_with_the_poses():
 
 def test_evidence_tells_rigs_with_depth_errors_from_those_without():
     px = (0.3, -0.25, 0.2, -0.3)
-    assert registered(seen(), RIG, GOOD).bias_scale < 0.6 < registered(seen(STEPS, px), RIG, GOOD).bias_scale
+    assert registered(seen(), RIG, GOOD).scales.bias < 0.6 < registered(seen(STEPS, px), RIG, GOOD).scales.bias
 
 
 def test_evidence_tells_rough_poses_from_good_ones():
-    good, rough = (registered(seen(), off(size, 3), None).prior_scale["cam1"] for size in (GOOD, ROUGH))
+    good, rough = (registered(seen(), off(size, 3), None).scales.default for size in (GOOD, ROUGH))
     # The default is 0.3 degrees and 6 mm.
-    assert good < 0.5 < 0.7 < rough < 2.5
+    for aspect in ASPECTS:
+        name = default_of(aspect, "cam1")
+        assert good[name] < 0.5 < 0.7 < rough[name] < 2.5
+
+
+def off_in_plan(seed: int) -> dict[str, Pose]:
+    """Level and at the right height, as levelling leaves poses, but turned and shifted over the floor."""
+    rng = np.random.default_rng(seed)
+    return {
+        name: make_pose(
+            exp_so3(np.radians([0.0, rng.normal(0, 0.6), 0.0])) @ T[:3, :3],
+            T[:3, 3] + 0.012 * rng.normal(size=3) * [1, 0, 1],
+        )
+        for name, T in RIG.items()
+    }
+
+
+def in_promised(found: Registration) -> list[float]:
+    """Errors of places beside the reference, in what is promised."""
+    return [error / found.pair_sigma_mm("cam0", name) for name, error in errors_mm(found.T_world_cam).items()]
+
+
+def test_floors_that_agree_do_not_vouch_for_yaw_and_place(monkeypatch: pytest.MonkeyPatch):
+    def surprise() -> float:
+        found = [registered(seen(), off_in_plan(seed), None) for seed in (5, 6, 7)]
+        return float(np.sqrt(np.mean(np.square([in_promised(f) for f in found]))))
+
+    # One if all is exact; a size that three numbers a camera tell is known to half itself.
+    assert surprise() < 2.0
+    # One size for all six: tilt and height, which are right, make the rest look good.
+    for module in ("icp_prior", "icp_evidence"):
+        monkeypatch.setattr(f"aruco.{module}.ASPECTS", {"all": tuple(range(6))})
+    assert surprise() > 2.5
+
+
+def test_depth_better_than_promised_counts_for_more_but_not_for_ever(rough: Registration):
+    # White noise of 0.03 px, a tenth of which is left in a cell, where 0.06 px that all of it shares is promised.
+    assert rough.scale == LEAST_SCALE
+    few = rough.rows.only(np.arange(3))
+    # Of three gaps chance may make as little.
+    assert residual_scale(few, 0.2 * np.sqrt(few.variance)) > LEAST_SCALE
+    assert residual_scale(rough.rows, 3.0 * 0.6745 * np.sqrt(rough.rows.variance)) == pytest.approx(3.0)
 
 
 def test_noise_in_slopes_would_shrink_clouds():
@@ -306,7 +357,11 @@ def test_gaps_follow_every_unknown_as_their_derivatives_say(two: Two):
     surfaces = {name: cloud.depth_m for name, cloud in clouds.items()}
 
     def rows(state: State) -> Rows:
-        now = state.corrected(clouds)
+        # Normals follow depth errors too; how that changes gaps has no mean.
+        now = {
+            name: replace(cloud, depth_m=cloud.depth_m + state.bias[name] @ cloud.slopes)
+            for name, cloud in clouds.items()
+        }
         pair = pair_rows(state, now, surfaces, layout, there, back, both_normals=False)
         floors = [floor_rows(state, now, surfaces, layout, name) for name in layout.cameras]
         return joined([pair, *floors], clouds, layout)[0]
@@ -318,8 +373,10 @@ def test_gaps_follow_every_unknown_as_their_derivatives_say(two: Two):
         x[k] = 1e-6
         measured = (rows(state.moved(x, layout)).gap_m - here.gap_m) / 1e-6
         told = (here.gaps(x, layout) - here.gap_m) / 1e-6
-        # Second order, 1e-6 times metres; slopes of the floor turn its normal by their square only.
-        np.testing.assert_allclose(measured, told, atol=2e-5)
+        # Second order, 1e-6 times metres; slopes of the floor turn its normal by their square only. Depth errors of
+        # both cameras are told where the source's sample lies, up to a few cm beside the target's.
+        is_error = any(layout.bias(name).start <= k < layout.bias(name).stop for name in layout.cameras)
+        np.testing.assert_allclose(measured, told, atol=0.02 * np.abs(told).max() if is_error else 2e-5)
 
 
 def test_what_both_directions_see_counts_once(two: Two):
@@ -343,14 +400,13 @@ def test_what_both_directions_see_counts_once(two: Two):
     assert np.trace(twice) / np.trace(both) < 1.05
 
 
-def test_moving_back_to_the_start_is_what_keeping_all_cameras_is(rough: Registration):
-    x = rough.solution(kept=("cam1", "cam2", "cam3"))
-    state = standing({name: invert_transform(rough.T_out_own) @ T for name, T in rough.T_world_cam.items()})
-    moved, start = state.moved(x, rough.layout).T_world_cam, off(ROUGH, 1)
+def test_moving_back_leads_to_the_start(rough: Registration):
+    start = off(ROUGH, 1)
     for name in ("cam1", "cam2", "cam3"):
-        kept, true = (invert_transform(T["cam0"]) @ T[name] for T in (moved, start))
-        # Linear: products of two turns of 0.3 degrees, over 4 m.
-        np.testing.assert_allclose(kept, true, atol=3e-4)
+        kept = exp_se3(rough.back[name]) @ invert_transform(rough.T_out_own) @ rough.T_world_cam[name]
+        reference = invert_transform(rough.T_out_own) @ rough.T_world_cam["cam0"]
+        expected = invert_transform(start["cam0"]) @ start[name]
+        np.testing.assert_allclose(invert_transform(reference) @ kept, expected, atol=1e-9)
 
 
 def test_covariances_are_symmetric_and_positive(rough: Registration):
@@ -364,3 +420,23 @@ def test_covariances_are_symmetric_and_positive(rough: Registration):
     # The reference is known as it was given.
     np.testing.assert_allclose(rough.covariance["cam0"], covariance(off(ROUGH, 1)["cam0"], ROUGH), rtol=0.01, atol=1e-7)
     assert rough.pair_sigma_mm("cam1", "cam2") == pytest.approx(rough.pair_sigma_mm("cam2", "cam1"), rel=0.3)
+
+
+def test_cameras_that_stay_are_known_as_they_were_told_to_be():
+    start = off(ROUGH, 1)
+    levelled = {name: covariance(T, (0.1, 5.0)) for name, T in start.items()}
+    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, ROUGH)) for name, T in start.items()}
+    pairs = overlapping_pairs(seen(), start, FULL)
+    found, plain = (
+        register(
+            seen(), start, priors, pairs, FULL, floor=LEVEL, reference="cam0", kept=["cam3"], start_covariances=told
+        )
+        for told in (levelled, None)
+    )
+    for name in ("cam0", "cam3"):
+        np.testing.assert_allclose(found.covariance[name], levelled[name], rtol=1e-6, atol=1e-12)
+    for name in ("cam1", "cam2"):
+        assert np.linalg.eigvalsh(found.covariance[name]).min() > 0
+        # Others are moved to where the reference stands, and are as well known as that.
+        assert np.trace(found.covariance[name]) < 0.7 * np.trace(plain.covariance[name])
+        np.testing.assert_array_equal(found.T_world_cam[name], plain.T_world_cam[name])

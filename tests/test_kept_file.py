@@ -43,7 +43,7 @@ def skewed() -> str:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        (f'{{"x": {{"pose": "{POSE}", "rms_px": NaN}}}}', "NaN is not a finite number"),
+        (f'{{"x": {{"pose": "{POSE}", "rms_px": NaN}}}}', "old.json: x.rms_px: NaN is not a finite number"),
         (f'{{"x": {{"pose": "{POSE}", "rms_px": -Infinity}}}}', "-Infinity is not a finite number"),
         (f'{{"x": {{"pose": "{POSE}", "rms_px": 1e999}}}}', "1e999 is not a finite number"),
         (covariance(json.dumps([10**400] * 36)), "covariance of camera x is not 36 numbers"),

@@ -511,24 +511,48 @@ def test_an_extrinsics_file_that_is_none(text: str, rig: Path, store: Path, tmp_
     refused(rig, store, tmp_path, "rig.json")
 
 
+EMPTY_DEPTH: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "zero": np.zeros_like,
+    "NaN": lambda z: np.full_like(z, np.nan),
+    "infinite": lambda z: np.full_like(z, np.inf),
+}
 BAD_DEPTH: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Sequence[str]]] = {
-    "zero": (np.zeros_like, ("zero",)),
-    "NaN": (lambda z: np.full_like(z, np.nan), ("NaN",)),
-    "infinite": (lambda z: np.full_like(z, np.inf), ("infinite",)),
     "negative": (lambda z: -z, ("negative",)),
     "millimetres": (lambda z: 1000 * z, ("millimetres", "1000")),
 }
 
 
+def spoilt(store: Path, folder: Path, cameras: Sequence[str], spoil: Callable[[np.ndarray], np.ndarray]) -> Path:
+    """The store with other depth of some cameras."""
+    path = Path(shutil.copy(store, folder / "spoilt.h5"))
+    with h5py.File(path, "r+") as file:
+        for name in cameras:
+            depth = file[f"cameras/{name}/depth"]
+            assert isinstance(depth, h5py.Dataset)
+            depth[...] = spoil(depth[...])
+    return path
+
+
 @pytest.mark.parametrize("name", BAD_DEPTH)
 def test_bad_depth(name: str, rig: Path, store: Path, tmp_path: Path) -> None:
     spoil, words = BAD_DEPTH[name]
-    spoilt = Path(shutil.copy(store, tmp_path / "spoilt.h5"))
-    with h5py.File(spoilt, "r+") as file:
-        depth = file["cameras/cam1/depth"]
-        assert isinstance(depth, h5py.Dataset)
-        depth[...] = spoil(depth[...])
-    refused(rig, spoilt, tmp_path, "cam1", *words)
+    refused(rig, spoilt(store, tmp_path, ["cam1"], spoil), tmp_path, "cam1", *words)
+
+
+@pytest.mark.parametrize("name", EMPTY_DEPTH)
+def test_one_camera_that_measured_nothing_does_not_stop_the_others(
+    name: str, rig: Path, store: Path, tmp_path: Path
+) -> None:
+    result = level(rig, spoilt(store, tmp_path, ["cam1"], EMPTY_DEPTH[name]), tmp_path / "level.json")
+    assert result.exit_code == 3, result.output
+    assert "WARNING depth of cameras cam1 holds no measurement" in result.output
+    note = json.loads((tmp_path / "level.json").read_text())["_meta"]["ground_refined"]
+    assert list(note["without_correction"]) == ["cam1"]
+
+
+@pytest.mark.parametrize("name", EMPTY_DEPTH)
+def test_cameras_none_of_which_measured_anything(name: str, rig: Path, store: Path, tmp_path: Path) -> None:
+    refused(rig, spoilt(store, tmp_path, list(TRUE), EMPTY_DEPTH[name]), tmp_path, "cam0", name)
 
 
 BAD_STORES: dict[str, tuple[Callable[[h5py.File], object], Sequence[str]]] = {

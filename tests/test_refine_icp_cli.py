@@ -99,6 +99,7 @@ def some_metrics(**other: Any) -> ICPMetrics:
         "biases": {MOVED: NEW_BIAS},
         "floor_tilt_deg": 0.01,
         "floor_rise_m": 0.0004,
+        "floor_sigmas": 1.5,
     }
     return ICPMetrics(**{**values, **other})
 
@@ -288,7 +289,7 @@ def test_only_what_was_accepted_is_moved(rig: Path, store: Path, tmp_path: Path,
     assert np.array_equal(after[MOVED], MOTION @ before[MOVED])
     levelled = json.loads((tmp_path / "level.json").read_text())
     assert all(content[name]["pose"] == levelled[name]["pose"] for name in TRUE if name != MOVED)
-    assert "ICP refinement: 1 of 3 cameras was moved." in said
+    assert said.count("ICP refinement: 1 of 3 cameras was moved.") == 1
     assert content["_meta"]["world"] == {"up": [0, 1, 0], "origin": "floor"}
     assert content["_meta"]["ground_refined"] == levelled["_meta"]["ground_refined"]
 
@@ -343,7 +344,9 @@ def test_biases_are_replaced_and_the_old_ones_told(rig: Path, store: Path, tmp_p
     change(rig, lambda content: content["_meta"].update(depth_bias={MOVED: old, KEPT: old}))
     content, said = registered(rig, store, tmp_path / "out.json")
     assert content["_meta"]["depth_bias"] == {MOVED: NEW_BIAS.as_dict(), KEPT: old}
-    assert content["_meta"]["icp_refined"]["depth_bias"] == {MOVED: {"before": old, "after": NEW_BIAS.as_dict()}}
+    assert content["_meta"]["icp_refined"]["depth_bias"] == {
+        MOVED: {"before": old, "after": NEW_BIAS.as_dict(), "written": True}
+    }
     assert NEW_BIAS.as_dict()["sigma_disparity_px"] == pytest.approx(0.05)
     assert "+0.10 px" in said
 
@@ -355,6 +358,49 @@ def test_a_file_without_bias_gets_what_was_estimated(rig: Path, store: Path, tmp
     content, said = registered(rig, store, tmp_path / "out.json")
     assert "depth_bias" not in content["_meta"]
     assert "Depth bias" not in said
+
+
+def test_a_bias_goes_only_with_the_pose_that_it_was_estimated_with(
+    rig: Path, store: Path, tmp_path: Path, fake: Fake
+) -> None:
+    old = DepthBias(scale=0.001, inverse_depth=0.0, focal_baseline=FOCAL_BASELINE).as_dict()
+    change(rig, lambda content: content["_meta"].update(depth_bias={KEPT: old}))
+    fake.metrics = some_metrics(biases=dict.fromkeys((REFERENCE, MOVED, KEPT), NEW_BIAS))
+    content, said = registered(rig, store, tmp_path / "out.json")
+    new = NEW_BIAS.as_dict()
+    assert content["_meta"]["depth_bias"] == {REFERENCE: new, MOVED: new, KEPT: old}
+    told = content["_meta"]["icp_refined"]["depth_bias"]
+    assert {name: bias["written"] for name, bias in told.items()} == {REFERENCE: True, MOVED: True, KEPT: False}
+    assert told[KEPT]["after"] == new
+    assert "no, pose kept" in said
+    # Where nothing moved, biases estimated beside refused poses are none to go by.
+    kept = {n: dataclasses.replace(move, accepted=False) for n, move in fake.metrics.cameras.items()}
+    fake.metrics = dataclasses.replace(fake.metrics, cameras=kept)
+    content, _ = registered(rig, store, tmp_path / "out.json")
+    assert content["_meta"]["depth_bias"] == {KEPT: old}
+
+
+def test_covariances_of_cameras_that_stay_stay(rig: Path, store: Path, tmp_path: Path, fake: Fake) -> None:
+    level(rig, store, tmp_path / "level.json")
+    content, _ = registered(rig, store, tmp_path / "out.json")
+    levelled = json.loads((tmp_path / "level.json").read_text())["_meta"]["covariance"]
+    assert [name for name in TRUE if content["_meta"]["covariance"][name] != levelled[name]] == [MOVED]
+
+
+def test_warnings_and_remarks_are_told_everywhere(rig: Path, store: Path, tmp_path: Path, fake: Fake) -> None:
+    fake.metrics = some_metrics(warnings=("Look at cam2 <now>.",), remarks=("The floor leans.",), settled=False)
+    content, said = registered(rig, store, tmp_path / "out.json", "--plot")
+    assert said.count("WARNING Look at cam2 <now>.") == 1
+    assert said.count("The floor leans.") == 1
+    note = content["_meta"]["icp_refined"]
+    assert (note["warnings"], note["remarks"], note["settled"]) == (
+        ["Look at cam2 <now>."],
+        ["The floor leans."],
+        False,
+    )
+    page = (tmp_path / "out.html").read_text()
+    assert "Look at cam2 &lt;now&gt;." in page
+    assert "The floor leans." in page
 
 
 def test_the_note_tells_every_pair_and_camera(rig: Path, store: Path, tmp_path: Path, fake: Fake) -> None:
@@ -375,7 +421,7 @@ def test_the_note_tells_every_pair_and_camera(rig: Path, store: Path, tmp_path: 
     T = np.array([float(x) for x in note["cameras"][MOVED]["T_world_new_old"].split()]).reshape(4, 4)
     assert np.allclose(T, MOTION, atol=1e-12)
     assert np.allclose([float(x) for x in note["cameras"][KEPT]["T_world_new_old"].split()], np.eye(4).ravel())
-    assert note["floor"] == {"tilt_deg": 0.01, "rise_m": 0.0004}
+    assert note["floor"] == {"tilt_deg": 0.01, "rise_m": 0.0004, "sigmas": 1.5}
     assert (note["pairs_attempted"], note["cameras_disconnected"]) == (2, 1)
     assert all(len(digest) == 64 for digest in note["provenance"]["inputs_sha256"].values())
 
@@ -396,6 +442,11 @@ def test_the_same_clouds_twice_are_remarked(rig: Path, store: Path, tmp_path: Pa
     assert "registered with this depth before" not in said
     _, said = registered(tmp_path / "once.json", store, tmp_path / "twice.json")
     assert "registered with this depth before" in said
+    # What moved nothing has told the covariances nothing.
+    fake.metrics = some_metrics(cameras={KEPT: fake.metrics.cameras[KEPT]})
+    registered(rig, store, tmp_path / "kept.json")
+    _, said = registered(tmp_path / "kept.json", store, tmp_path / "kept_twice.json")
+    assert "registered with this depth before" not in said
     other = store_of(tmp_path / "other.h5", depth_of(TRUE, disparity_px=0.01))
     _, said = registered(tmp_path / "once.json", other, tmp_path / "twice.json")
     assert "registered with this depth before" not in said

@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from floor_rooms import FLOOR, ROOM, Wall, depth_of
@@ -167,7 +170,61 @@ def test_cameras_that_see_nothing_in_common(tmp_path: Path) -> None:
         name: look_at(np.array([x, 1.6, 0.0]), np.array([3.0 * x, 0.0, 0.0])) for name, x in (("a", 1.5), ("b", -1.5))
     }
     write_json(tmp_path / "rig.json", document(apart))
-    failed(tmp_path / "rig.json", store_of(tmp_path / "apart.h5", depth_of(apart, (FLOOR,))), tmp_path)
+    content = failed(tmp_path / "rig.json", store_of(tmp_path / "apart.h5", depth_of(apart, (FLOOR,))), tmp_path)
+    note = content["_meta"]["icp_refined"]
+    assert [(pair["source"], pair["target"], pair["overlap_m2"]) for pair in note["pairs"]] == [("a", "b", 0.0)]
+    assert note["cameras"].keys() == {"a", "b"}
+
+
+def test_too_coarse_a_voxel_is_told_with_what_is_left_of_each_cloud(small: Path, slid: Path, tmp_path: Path) -> None:
+    content, said = registered(slid, small, tmp_path / "out.json", "--icp-voxel-size", 1, code=3)
+    message = content["_meta"]["icp_refined"]["message"]
+    assert all(re.search(rf"{name}: \d+ samples", message) for name in TRUE), message
+    assert "--icp-voxel-size" in message
+    assert said.count("ICP refinement failed") == 1
+
+
+def test_a_second_pass_over_its_own_output_changes_little_and_says_so(furnished: Run, tmp_path: Path) -> None:
+    _, said = registered(furnished.out, furnished.store, tmp_path / "twice.json")
+    assert "were registered with this depth before" in said
+    once, twice = read_poses(furnished.out), read_poses(tmp_path / "twice.json")
+    # Less than the 5 mm to which the first pass knows them, and no drift away from the truth.
+    assert max(float(np.abs((once[n] - twice[n])[:3, 3]).max()) for n in once) < 5e-3
+    before, after = (np.median(pair_errors_mm(poses)) for poses in (once, twice))
+    assert after < before + 1
+
+
+def test_biases_that_are_known_are_taken_out_and_told(slid: Path, small: Path, tmp_path: Path) -> None:
+    known = {"scale": 0.0, "disparity_px": 0.0, "focal_baseline": 84.0, "sigma_scale": 1e-4}
+    known |= {"sigma_disparity_px": 0.005, "correlation": 0.0}
+    change(slid, lambda content: content["_meta"].update(depth_bias=dict.fromkeys(TRUE, known)))
+    content, _ = registered(slid, small, tmp_path / "out.json")
+    for bias in content["_meta"]["icp_refined"]["depth_bias"].values():
+        assert bias["before"]["sigma_scale"] == pytest.approx(1e-4)
+        # What is known that well clouds of small images cannot correct.
+        assert abs(bias["after"]["scale"]) < 3e-4
+        assert bias["after"]["sigma_scale"] <= 1.001e-4
+
+
+def test_cameras_of_which_no_baseline_is_known_are_registered(slid: Path, tmp_path: Path) -> None:
+    depth = {name: dataclasses.replace(d, baseline_m=None) for name, d in depth_of(TRUE, FURNISHED).items()}
+    content, _ = registered(slid, store_of(tmp_path / "nobase.h5", depth), tmp_path / "out.json")
+    for bias in content["_meta"]["icp_refined"]["depth_bias"].values():
+        assert "disparity_px" not in bias["after"]
+
+
+def test_one_camera_that_measured_nothing_does_not_stop_the_registration(
+    slid: Path, small: Path, tmp_path: Path
+) -> None:
+    blind = Path(shutil.copy(small, tmp_path / "blind.h5"))
+    with h5py.File(blind, "r+") as file:
+        file["cameras/cam1/depth"].write_direct(np.full(file["cameras/cam1/depth"].shape, np.nan, np.float32))  # pyright: ignore
+    content, said = registered(slid, blind, tmp_path / "out.json", code=3)
+    note = content["_meta"]["icp_refined"]
+    assert note["success"]
+    assert note["pairs_attempted"] == 3
+    assert note["cameras"]["cam1"]["refusal"] == "no_cloud"
+    assert "1 no depth that can be used" in said or "1 kept" in said
 
 
 def test_a_camera_that_meets_no_other_keeps_its_pose(slid: Path, tmp_path: Path) -> None:
@@ -180,8 +237,13 @@ def test_a_camera_that_meets_no_other_keeps_its_pose(slid: Path, tmp_path: Path)
     content, said = registered(slid, four, tmp_path / "out.json")
     assert np.array_equal(read_poses(tmp_path / "level.json")["cam3"], read_poses(tmp_path / "out.json")["cam3"])
     assert content["_meta"]["icp_refined"]["cameras_disconnected"] == 1
-    assert not any("cam3" in pair.values() for pair in content["_meta"]["icp_refined"]["pairs"])
+    apart = [pair for pair in content["_meta"]["icp_refined"]["pairs"] if "cam3" in pair.values()]
+    assert len(apart) == 3
+    for pair in apart:
+        assert (pair["overlaps"], pair["overlap_m2"], pair["converged"], pair["n_points"]) == (False, 0.0, False, 0)
+        assert "share less than" in pair["verdict"]
     assert "cam3 │ took no part" in said
+    assert "WARNING The rig is in 2 parts whose clouds do not overlap: cam0, cam1, cam2; cam3." in said
     assert "camera cam3: " in said
 
 
@@ -205,7 +267,11 @@ def test_every_choice_runs(more: tuple[object, ...], slid: Path, small: Path, tm
     content, _ = registered(slid, small, tmp_path / "out.json", *more)
     note = content["_meta"]["icp_refined"]
     assert len(note["pairs"]) == note["pairs_attempted"] > 0
-    assert ("depth_bias" in content["_meta"]) == bool(note["depth_bias"]) == (more != ("--no-icp-depth-bias",))
+    assert bool(note["depth_bias"]) == (more != ("--no-icp-depth-bias",))
+    # Only with the poses that they were estimated with.
+    written = {name for name, bias in note["depth_bias"].items() if bias["written"]}
+    assert content["_meta"].get("depth_bias", {}).keys() == written
+    assert bool(written) == bool(note["moved"] and note["depth_bias"])
 
 
 def test_holes_and_wrong_depth_do_not_stop_it(slid: Path, tmp_path: Path) -> None:

@@ -111,6 +111,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def read_json_and_digest(path: Path) -> tuple[dict[str, Any], str]:
     """The same, and the SHA-256 of the bytes that were read."""
+    raw = b""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"{path}: over {MAX_FILE_BYTES >> 20} MiB, which is not an extrinsics file.")
@@ -118,6 +119,8 @@ def read_json_and_digest(path: Path) -> tuple[dict[str, Any], str]:
         content = json.loads(raw.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
+    except _NoNumberError as error:
+        raise InputError(f"{path}: {_place_of(raw)}: {error}; mend or remove it.") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON file ({error}); give an extrinsics file.") from error
     if not isinstance(content, dict):
@@ -129,8 +132,28 @@ def _finite(text: str) -> float:
     """A number; JSON has neither NaN nor Infinity, and Python would read 1e999 as the latter."""
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text} is not a finite number")
+        raise _NoNumberError(f"{text} is not a finite number")
     return value
+
+
+class _NoNumberError(ValueError):
+    """NaN, or what is like it."""
+
+
+def _place_of(raw: bytes) -> str:
+    """Where a file holds its first number that is none."""
+    try:
+        content = json.loads(raw.decode("utf-8"))
+    except (ValueError, RecursionError):
+        return "it"
+    todo: list[tuple[str, Any]] = [("", content)]
+    while todo:
+        place, node = todo.pop()
+        if isinstance(node, float) and not math.isfinite(node):
+            return place
+        inner = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+        todo += reversed([(f"{place}.{key}" if place else str(key), value) for key, value in inner])
+    return "it"
 
 
 def _cameras(content: Mapping[str, Any], path: Path) -> dict[str, Any]:

@@ -35,6 +35,8 @@ _STYLE = """<style>
 .icp th, .icp td { text-align: right; vertical-align: top; }
 .icp th:last-child, .icp td:last-child { text-align: right; }
 .icp th.w, .icp td.w { text-align: left; }
+p.icp { color: #555; font-size: .9em; }
+h1 { margin-top: 2em; }
 </style>"""
 
 
@@ -42,7 +44,7 @@ def icp_section(
     views: Sequence[CloudView],
     sheets: Sequence[Sheet],
     remarks: Sequence[str],
-    fact: str,
+    facts: Sequence[str],
     *,
     up_y: int,
     floor_y: float,
@@ -53,12 +55,13 @@ def icp_section(
         views: Of the cameras with depth; none if nothing was registered.
         sheets: The tables.
         remarks: Sentences about single cameras.
-        fact: What became of the rig.
+        facts: What became of the rig, and what it asks for.
         up_y: 1 if the world's y axis points up, -1 if down.
         floor_y: Where the floor is.
     """
     return (
-        f"{_STYLE}<h1>Clouds against clouds</h1><p>{escape(fact)}</p>",
+        f"{_STYLE}<h1>Clouds against clouds</h1>",
+        *(f"<p>{escape(fact)}</p>" for fact in facts),
         *(sheet_table(sheet) for sheet in sheets[:1]),
         *(["<ul>", *(f"<li>{escape(remark)}</li>" for remark in remarks), "</ul>"] if remarks else []),
         *(sheet_table(sheet) for sheet in sheets[1:]),
@@ -88,7 +91,7 @@ def sheet_table(sheet: Sheet) -> str:
     ]
     body = "\n".join(rows)
     table = f'<table class="icp"><thead><tr>{header}</tr></thead><tbody>\n{body}\n</tbody></table>'
-    return f"<h2>{escape(sheet.title)}</h2>{table}"
+    return f'<h2>{escape(sheet.title)}</h2>{table}<p class="icp">{escape(sheet.legend)}</p>'
 
 
 def _class(word: bool) -> str:

@@ -48,7 +48,7 @@ def furniture_panels(cameras_m: Sequence[Array], targets_m: Sequence[Array], rng
     Returns:
         The panels of as many pieces as find a free place.
     """
-    pieces = [(0.65, _table), (0.35, _carton), (0.3, _cylinder), (0.35, _carton), (0.35, _carton)]
+    pieces = [(0.65, table), (0.35, carton), (0.3, cylinder), (0.35, carton), (0.35, carton)]
     taken: list[tuple[Array, float]] = []
     panels: list[Panel] = []
     for radius_m, build in pieces:
@@ -90,7 +90,8 @@ def _standing(size_m: Sequence[float], T_world_base: Pose, base_m: Sequence[floa
     return box_panels(size_m, T_world_base @ make_pose(np.eye(3), centre), albedo)
 
 
-def _table(T_world_base: Pose, rng: np.random.Generator) -> list[Panel]:
+def table(T_world_base: Pose, rng: np.random.Generator) -> list[Panel]:
+    """A table with a thing on it, its feet on the y = 0 of its own frame."""
     length, width, height = rng.uniform(0.8, 1.0), rng.uniform(0.5, 0.7), rng.uniform(0.65, 0.78)
     panels = _standing((length, 0.04, width), T_world_base, (0, height - 0.04, 0), 0.42)
     for sx in (-1, 1):
@@ -100,10 +101,12 @@ def _table(T_world_base: Pose, rng: np.random.Generator) -> list[Panel]:
     return panels + _standing((0.3, 0.2, 0.22), T_world_base, (0.1, height, 0.05), 0.6)
 
 
-def _carton(T_world_base: Pose, rng: np.random.Generator) -> list[Panel]:
+def carton(T_world_base: Pose, rng: np.random.Generator) -> list[Panel]:
+    """A box that stands on the y = 0 of its own frame."""
     size_m = [rng.uniform(0.25, 0.45), rng.uniform(0.3, 0.9), rng.uniform(0.25, 0.45)]
     return _standing(size_m, T_world_base, (0, 0, 0), rng.uniform(0.3, 0.6))
 
 
-def _cylinder(T_world_base: Pose, rng: np.random.Generator) -> list[Panel]:
+def cylinder(T_world_base: Pose, rng: np.random.Generator) -> list[Panel]:
+    """An upright cylinder that stands on the y = 0 of its own frame."""
     return cylinder_panels(rng.uniform(0.12, 0.25), rng.uniform(0.5, 1.1), T_world_base, rng.uniform(0.25, 0.5))
