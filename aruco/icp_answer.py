@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
@@ -27,12 +26,12 @@ from aruco.icp_headline import (
     warnings_of,
     why_nothing,
 )
+from aruco.icp_match import shared_areas
 from aruco.icp_prior import Prior
 from aruco.icp_solve import Registration
-from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics, ICPResult
+from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics, ICPResult, Pair
 from aruco.pose_math import Array, Pose, invert_transform, make_pose, rotation_angle, skew
 
-Pair = tuple[str, str]
 Answer = tuple[dict[str, Pose], ICPMetrics]
 # A pair that shares nothing says nothing of any direction.
 _ALL = ("turn about x", "yaw", "turn about z", "shift along x", "height", "shift along z")
@@ -94,10 +93,16 @@ def pair_result(given: Given, pair: Pair, tried: Registration, believed: Registr
 
 
 def pairs_apart(
-    clouds: Collection[str], met: Collection[Pair], poses: Mapping[str, Pose], config: ICPConfig
+    met: Collection[Pair], areas: Mapping[Pair, float], poses: Mapping[str, Pose], config: ICPConfig
 ) -> dict[Pair, ICPResult]:
-    """The pairs of clouds that do not overlap, with nothing to tell of them but where they stand."""
-    least = config.min_overlap_area
+    """The pairs that were not looked at, with nothing to tell of them but where they stand and what they share.
+
+    Args:
+        met: Pairs that were looked at.
+        areas: Of all pairs of clouds, seen from above [m^2].
+        poses: Camera -> T_world_cam.
+        config: Least area.
+    """
     return {
         pair: ICPResult(
             transformation=_relative(poses, pair),
@@ -105,14 +110,20 @@ def pairs_apart(
             inlier_rmse=math.nan,
             information_matrix=np.zeros((6, 6)),
             converged=False,
-            overlap_m2=0.0,
+            overlap_m2=area,
             unobservable=_ALL,
-            verdict=f"do not overlap: seen from above they share less than {least:g} m2, or no surface",
+            verdict=_why_apart(area, config),
             overlaps=False,
         )
-        for pair in combinations(sorted(clouds), 2)
+        for pair, area in areas.items()
         if pair not in met
     }
+
+
+def _why_apart(area_m2: float, config: ICPConfig) -> str:
+    if area_m2 < config.min_overlap_area or area_m2 <= 0:
+        return f"do not overlap: seen from above they share less than {config.min_overlap_area:g} m2 ({area_m2:.1f})"
+    return "do not meet: they share an area seen from above, but hardly any surface in it"
 
 
 def _relative(poses: Mapping[str, Pose], pair: Pair) -> Pose:
@@ -140,7 +151,7 @@ def nothing_met(
         metrics,
         message=why_nothing(len(poses), len(clouds), left_out),
         cameras=dict(sorted({**unmoved(left_out), **alone}.items())),
-        per_pair_results=pairs_apart(clouds, (), poses, config),
+        per_pair_results=pairs_apart((), shared_areas(clouds, poses, config), poses, config),
     )
 
 
@@ -161,10 +172,11 @@ def answered(given: Given, parts: Sequence[Part], left_out: Mapping[str, str], m
     alone = sorted(given.clouds.keys() - {name for part in parts for name in part.cameras})
     tilt_deg, rise_m, sigmas = _floor_after(main.result, given)
     used = sum(result.converged for result in results.values())
-    apart = pairs_apart(given.clouds, results, poses, given.config)
+    areas = shared_areas(given.clouds, {**given.start, **given.begin}, given.config)
+    apart = pairs_apart(results, areas, poses, given.config)
     answer = replace(
         metrics,
-        success=used > 0,
+        success=True,
         num_pairs_converged=used,
         num_cameras_optimized=len(main.cameras),
         num_disconnected=len(poses) - len(main.cameras),

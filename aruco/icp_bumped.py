@@ -2,7 +2,7 @@
 
 Owns      what is known of a camera that was found, that a place which is refused leaves no trace, what is told of it.
 Leaves    who looks bumped and where it fits to icp_looking, whether a camera is moved there to icp_gates and
-          icp_confirm, sentences to icp_bumped_words.
+          icp_suspects, sentences to icp_words.
 
 What was known of such a camera's pose is void: where clouds contradict it, it was not bumped by a few of its sigmas.
 """
@@ -18,19 +18,19 @@ from typing import Any
 import numpy as np
 from loguru import logger
 
-from aruco import icp_bumped_words as words
+from aruco import icp_words as words
 from aruco.depth_bias import DepthBias
 from aruco.floor_model import centre_jacobian
 from aruco.floor_plane import FloorPlane
-from aruco.icp_confirm import doubt_about
 from aruco.icp_looking import Looked, bounds_of, looked_again, looked_at, search_clouds, way
 from aruco.icp_prior import Prior
+from aruco.icp_suspects import doubt_about
 from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics
 from aruco.pose_math import Array, Pose
 
 Answer = tuple[dict[str, Pose], ICPMetrics]
-# What is known of a camera that was found elsewhere, one sigma. Proposals are off by 0.8 degrees and 4 cm in the
-# median, by 1.6 degrees and 14 cm at worst (see icp_global): they hold where clouds say nothing, and else give way.
+# What is known of a camera that was found elsewhere, one sigma: more than proposals are off (see icp_global), so that
+# they hold where clouds say nothing, and else give way.
 FOUND_TURN_RAD = math.radians(2.0)
 FOUND_SHIFT_M = 0.1
 
@@ -73,10 +73,13 @@ def looked_for(
 
 
 def found_prior(T_world_cam: Pose) -> Prior:
-    """What is known of a camera that was found at a place: as a bumped one's given pose is no knowledge, only that."""
+    """What is known of a camera that was found at a place: as a bumped one's given pose is no knowledge, only that.
+
+    It says nothing of how well marker poses are known.
+    """
     back = centre_jacobian(T_world_cam[:3, 3], inverse=True)
     at_centre: Array = np.diag([FOUND_TURN_RAD**2] * 3 + [FOUND_SHIFT_M**2] * 3)
-    return Prior(T_world_cam=T_world_cam, covariance=back @ at_centre @ back.T)
+    return Prior(T_world_cam=T_world_cam, covariance=back @ at_centre @ back.T, scaled=False)
 
 
 # ---------------------------------------------------------------------------------------------------- what is believed
@@ -134,7 +137,7 @@ def _told(
 
     gone = {name: way(given[name], new[name]) for name in sorted(looked.found.keys() - refused.keys())}
     for name, moved in gone.items():
-        cameras[name] = _found(cameras[name], way(given[name], looked.found[name]), moved)
+        cameras[name] = _found(cameras[name], moved, _known_to(metrics.covariances.get(name), new[name]))
     for name, (T, why) in refused.items():
         retold(name, partial(words.found_and_refused, way=way(given[name], T), why=why))
     for name in looked.nowhere:
@@ -144,11 +147,26 @@ def _told(
         seen = None if T is None else way(given[looked.reference], T)
         others = looked.against[looked.reference]
         retold(looked.reference, partial(words.reference_bumped, others=others, way=seen))
-    told = words.summary(gone, sorted(refused), sorted(looked.nowhere), looked.reference)
-    return replace(metrics, cameras=dict(sorted(cameras.items())), message=" ".join([metrics.message, *told]))
+    told = words.summary_of_bumped(gone, sorted(refused), sorted(looked.nowhere), looked.reference)
+    return replace(
+        metrics,
+        cameras=dict(sorted(cameras.items())),
+        message=" ".join([metrics.message, *told]),
+        warnings=(*metrics.warnings, *told),
+    )
 
 
-def _found(seen: CameraMove, off: tuple[float, float], moved: tuple[float, float]) -> CameraMove:
+def _known_to(covariance: Array | None, T_world_cam: Pose) -> tuple[float, float] | None:
+    """Standard deviations [deg], [m] of a pose in the direction that is known least."""
+    if covariance is None:
+        return None
+    J = centre_jacobian(T_world_cam[:3, 3])
+    S = J @ covariance @ J.T
+    turn, shift = (math.sqrt(max(float(np.linalg.eigvalsh(part)[-1]), 0.0)) for part in (S[:3, :3], S[3:, 3:]))
+    return math.degrees(turn), shift
+
+
+def _found(seen: CameraMove, moved: tuple[float, float], known: tuple[float, float] | None) -> CameraMove:
     """A move from where the camera was said to stand; that pose was not asked."""
-    reason = words.found(*off, seen.held_out_before_mm, seen.held_out_after_mm, seen.gain_sigmas)
+    reason = words.found(*moved, seen.held_out_before_mm, seen.held_out_after_mm, seen.gain_sigmas, known)
     return replace(seen, reason=reason, rotation_deg=moved[0], translation_mm=1e3 * moved[1], prior_sigmas=math.nan)

@@ -55,7 +55,6 @@ class Cloud:
     cell: NDArray[np.intp]  # (n,) square of depth_noise.CORRELATION_PX, numbered from 0: its samples share errors
     is_floor: Mask  # (n,)
     given_bias: DepthBias | None
-    n_frames: int
     focal_baseline: float | None
     floor: SeenPlane | None = None  # the floor as the camera itself sees it; its inliers do not index the samples
 
@@ -122,7 +121,6 @@ def cloud_of(
         K=view.K,
         stride=config.stride,
         grid=grid,
-        pixels=pixels,
         rays=view.samples.rays[chosen],
         depth_m=1.0 / view.samples.inverse[chosen],
         sigma_m=surfaces.noise_scale * view.sigma_m[chosen],
@@ -130,10 +128,10 @@ def cloud_of(
         bias_covariance=view.bias_covariance,
         normals=normals[chosen],
         normal_sigma=normal_sigma[chosen],
+        pixels=pixels,
         cell=squares(pixels, int(CORRELATION_PX)),
         is_floor=is_floor[chosen],
         given_bias=view.given_bias,
-        n_frames=view.n_frames,
         focal_baseline=view.focal_baseline,
         floor=planes.floor,
     )

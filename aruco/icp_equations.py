@@ -29,15 +29,15 @@ SURFACE_M = 0.0015
 FLATNESS_M = 0.002
 # Within a cell errors are alike, but not the same: share of the variance that differs between parts of a cell. Small
 # parts share it with the next cell's, so it averages out over samples rather than over parts: it is that of a quarter
-# of a cell and more. On ten simulated rigs (errors / sigma)^2 then is 0.9 to 1.2 in the middle; with 0.3 half more.
+# of a cell and more.
 UNSHARED = 0.6
 PART = 0.25
 # Gaps beyond this many sigma lose weight with their square: as deaf to strangers as Cauchy's, blind to none within.
 KAPPA = 2.5
 # Gaps are smaller than promised where promises hold for poses, because cells share errors with their neighbours and
-# those of a plane are smoothed: 0.56 to 0.6 of it on simulated rigs with furniture, 0.5 over floors. Less than that is
-# depth better than the noise model, as of another kind of sensor. No further than to the last: errors that are smooth
-# over patches go into poses and depth errors, and gaps do not tell them.
+# those of a plane are smoothed: about this part of it. Less than that is depth better than the noise model, as of
+# another kind of sensor. No further than to the last: errors that are smooth over patches go into poses and depth
+# errors, and gaps do not tell them.
 USUAL_RATIO = 0.5
 LEAST_SCALE = 0.5
 MEDIAN_SIGMA = (
@@ -123,7 +123,8 @@ def pair_rows(
     # A twist turns the normal of its own camera's surface along: what it then acts on is the other one's sample.
     there_p = transform_points(T_a, a.rays[i] * surfaces[a.camera][i, None])
     there_q = transform_points(T_b, b.rays[j] * surfaces[b.camera][j, None])
-    lever = np.where(first[:, None], there_p, there_q)
+    # Their mean turns half as far with each, about the middle of both.
+    lever = (there_p + there_q) / 2 if both_normals else np.where(first[:, None], there_p, there_q)
     arm = np.hstack([np.cross(lever, normal), normal])
     # At the same place too, not where the sample lies that was met: moving a plane by a depth error and back by a turn
     # must leave nothing. A centimetre would seem to tell depth errors by a bare floor.

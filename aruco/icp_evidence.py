@@ -13,7 +13,8 @@ Bayesian Learning for Neural Networks, 1996): what floors say of tilt and height
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from itertools import product
 
 import numpy as np
 
@@ -33,7 +34,9 @@ _OWN = np.geomspace(0.2, 20.0, 17)
 _DEPTH = {"bias": np.geomspace(0.1, 2.0, 13), "lean": np.geomspace(0.1, 2.0, 9)}
 
 
-def told_scales(known: Known, state: State, clouds: Normal, M: Array, current: Scales, *, biased: bool) -> Scales:
+def told_scales(
+    known: Known, state: State, clouds: Normal, M: Array, current: Scales, *, kept: Collection[str] = ()
+) -> Scales:
     """The factors that clouds tell.
 
     Args:
@@ -42,29 +45,27 @@ def told_scales(known: Known, state: State, clouds: Normal, M: Array, current: S
         clouds: What clouds say there.
         M: (size, k) the unknowns by the free ones.
         current: Factors that are taken to hold while others are told.
-        biased: Whether depth errors are estimated.
+        kept: Cameras that are not free to move. Of how well poses are known they say nothing; where nobody has said it
+            of theirs, it is as of the others in the middle.
     """
-    parts = known.parts(state)
-    unknown = [c for c in known.layout.cameras if not known.given(c)]
-    defaults = [[default_of(aspect, c) for c in unknown] for aspect in ASPECTS]
+    parts = known.parts(state, kept)
+    unknown = [c for c in known.layout.cameras if not known.given(c) and c not in kept]
     now = {
-        **{name: current.default.get(name, 1.0) for names in defaults for name in names},
-        **{"given": current.given, "bias": current.bias, "lean": current.lean, "measured": 1.0},
+        **{default_of(aspect, c): 1.0 for aspect in ASPECTS for c in unknown} | dict(current.default),
+        **{"given": current.given, "bias": current.bias, "lean": current.lean, "certain": 1.0},
     }
     now = {name: now[name] for name in parts}
-    if biased:
-        now.update(_told(clouds, parts, M, now, {name: values for name, values in _DEPTH.items() if name in parts}))
-    for names in defaults:
+    now.update(_told(clouds, parts, M, now, {name: values for name, values in _DEPTH.items() if name in parts}))
+    told: dict[str, float] = {}
+    for aspect in ASPECTS if unknown else ():
+        names = [default_of(aspect, c) for c in unknown]
         now.update(_told_defaults(clouds, parts, M, now, names))
+        told |= dict.fromkeys((default_of(aspect, c) for c in kept if not known.given(c)), _middle(now, names))
+        told |= {name: now[name] for name in names}
     if "given" in parts:
         now.update(_told(clouds, parts, M, now, {"given": _POSES}))
         now["given"] = max(now["given"], 1.0)
-    return Scales(
-        given=now.get("given", 1.0),
-        default={name: now[name] for names in defaults for name in names},
-        bias=now.get("bias", 1.0),
-        lean=now.get("lean", 1.0),
-    )
+    return Scales(given=now.get("given", 1.0), default=told, bias=now.get("bias", 1.0), lean=now.get("lean", 1.0))
 
 
 def _told_defaults(
@@ -74,19 +75,16 @@ def _told_defaults(
 
     One camera may have been displaced and the others be right; a factor for all would spoil these, and keep that one.
     """
-    if not names:
-        return {}
-    common = math.exp(float(np.mean([math.log(now[name]) for name in names])))
+    common = _middle(now, names)
     own = {name: now[name] / common for name in names}
-    weighed = [parts[name].normal.scaled(own[name] ** -2.0) for name in names]
-    together = Part(normal=sum(weighed[1:], weighed[0]), n=sum(parts[name].n for name in names))
+    together = Part.joined([parts[name].scaled(own[name]) for name in names])
     others = {name: part for name, part in parts.items() if name not in names}
     common = _told(clouds, {**others, "default": together}, M, now, {"default": _POSES})["default"]
     told = {name: common * own[name] for name in names}
     if len(names) > 2:  # of two nobody knows which is the odd one
         for name in names:
             tried = common * _OWN
-            logs = _evidence(clouds, parts, M, {**now, **told}, [name], tried[:, None])
+            logs = _evidence(clouds, parts, M, {**now, **told}, name, tried)
             logs -= 0.5 * (np.log(_OWN) / OWN_LOG_SIGMA) ** 2
             told[name] = _mean(logs, tried)
     return told
@@ -96,14 +94,17 @@ def _told(
     clouds: Normal, parts: Mapping[str, Part], M: Array, now: Mapping[str, float], tried: Mapping[str, Array]
 ) -> dict[str, float]:
     """Some factors at once, each tried at several values, the others as they are now."""
-    names = list(tried)
-    if not names:
+    if not tried:
         return {}
-    grid = np.stack([axis.ravel() for axis in np.meshgrid(*tried.values(), indexing="ij")], axis=1)
-    logs = _evidence(clouds, parts, M, now, names, grid)
-    widths = [SCALE_LOG_SIGMA if name in ("default", "given") else BIAS_LOG_SIGMA for name in names]
+    *first, last = tried
+    grid = np.array(list(product(*tried.values())))
+    logs = np.concatenate([
+        _evidence(clouds, parts, M, {**now, **dict(zip(first, values))}, last, tried[last])
+        for values in product(*(tried[name] for name in first))
+    ])  # fmt: skip
+    widths = [SCALE_LOG_SIGMA if name in ("default", "given") else BIAS_LOG_SIGMA for name in tried]
     logs -= 0.5 * ((np.log(grid) / widths) ** 2).sum(axis=1)
-    return {name: _mean(logs, grid[:, k]) for k, name in enumerate(names)}
+    return {name: _mean(logs, grid[:, k]) for k, name in enumerate(tried)}
 
 
 def _mean(logs: Array, values: Array) -> float:
@@ -112,19 +113,34 @@ def _mean(logs: Array, values: Array) -> float:
     return math.exp(float(weights @ np.log(values) / weights.sum()))
 
 
+def _middle(factors: Mapping[str, float], names: Sequence[str]) -> float:
+    return math.exp(float(np.mean([math.log(factors[name]) for name in names])))
+
+
 def _evidence(
-    clouds: Normal, parts: Mapping[str, Part], M: Array, now: Mapping[str, float], names: Sequence[str], grid: Array
+    clouds: Normal, parts: Mapping[str, Part], M: Array, now: Mapping[str, float], name: str, values: Array
 ) -> Array:
-    """Logarithm (k,) of the marginal likelihood for factors (k, len(names)), up to a constant."""
-    H, g = M.T @ clouds.H @ M, M.T @ clouds.g
-    for name in sorted(parts.keys() - set(names)):
-        part = parts[name].normal
-        H, g = H + M.T @ part.H @ M / now[name] ** 2, g + M.T @ part.g / now[name] ** 2
-    W = grid**-2.0
-    tried = [parts[name] for name in names]
-    H = H + np.einsum("kp,pij->kij", W, np.stack([M.T @ part.normal.H @ M for part in tried]))
-    g = g + W @ np.stack([M.T @ part.normal.g for part in tried])
-    chi2 = W @ np.array([part.normal.chi2 for part in tried])
-    chi2 = chi2 - np.einsum("ki,ki->k", g, np.linalg.solve(H, g[..., None])[..., 0])
-    log_prior = 2.0 * np.log(grid) @ np.array([float(part.n) for part in tried])
-    return -0.5 * (chi2 + np.linalg.slogdet(H)[1] + log_prior)
+    """Logarithm (k,) of the marginal likelihood for values (k,) of one factor, up to what no factor changes.
+
+    Everything is solved at one value s. At another one the rows of this part weigh d = 1 / value^2 - 1 / s^2 more.
+    That multiplies the determinant by det(I + d C), C being the covariance of the rows' residuals r, and adds
+    d r . (I + d C)^-1 r to chi-square (matrix determinant lemma, Woodbury): with C diagonal, both are sums.
+    """
+    part, middle = parts[name], math.exp(float(np.mean(np.log(values))))
+    factors = {other: now[other] for other in parts if other != name} | {name: middle}
+    everything = Part.joined([parts[other].scaled(factors[other]) for other in sorted(parts)])
+    H = M.T @ (clouds.H + everything.rows.T @ everything.rows) @ M
+    g = M.T @ (clouds.g + everything.rows.T @ everything.off)
+    rows = part.rows @ M
+    solved = np.linalg.solve(H, np.column_stack([g, rows.T]))
+    chi2 = everything.off @ everything.off - g @ solved[:, 0]
+    C = rows @ solved[:, 1:]
+    variance, axes = np.linalg.eigh((C + C.T) / 2)
+    residual = axes.T @ (part.off - rows @ solved[:, 0])
+    d = values[:, None] ** -2.0 - middle**-2.0
+    # By the part alone they are known to the middle value: no more is left of them.
+    grown = 1.0 + d * np.clip(variance, 0.0, middle**2)
+    chi2 = chi2 + (d * residual**2 / grown).sum(axis=1)
+    log_det = np.linalg.slogdet(H)[1] + np.log(grown).sum(axis=1)
+    log_prior = 2.0 * sum(len(parts[other].off) * math.log(factors[other]) for other in parts if other != name)
+    return -0.5 * (chi2 + log_det + log_prior + 2.0 * len(part.off) * np.log(values))

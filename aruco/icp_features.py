@@ -4,8 +4,8 @@ Owns      distinct_spots, matched_spots: which places two clouds may have in com
 Leaves    what matches say of a pose to icp_votes.
 
 A histogram describes how normals turn around a point (Rusu, Blodow and Beetz, "Fast point feature histograms for 3D
-registration", 2009). On simulated furniture seen from other sides one match in twenty is right, hardly more than
-chance: only many of them that agree mean something.
+registration", 2009). Of furniture seen from other sides, in noisy depth, few matches are right, hardly more than
+chance makes: only many of them that agree mean something.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from aruco.icp_agreement import first_of_voxels
 from aruco.icp_pair import cloud_of_points, quiet_open3d
 from aruco.pose_math import Array
 
-# Radii of 0.25 to 0.4 m find as many cameras; stereo depth rounds off what is smaller.
+# Stereo depth rounds off what is smaller; of what is larger another camera seldom sees the same part.
 SPOT_VOXEL_M = 0.06
 RADIUS_M = 0.3
 _NEIGHBOURS = 150

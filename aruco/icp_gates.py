@@ -27,16 +27,14 @@ from aruco.icp_solve import Pair, Registration
 from aruco.icp_types import CameraMove, ICPConfig, Refusal
 from aruco.pose_math import Pose, pose_distance
 
-# A move of a millimetre or two, which is what clouds can add to a good pose, is hardly ever proved by itself. So the
-# moves of a camera and of those that overlap it are proved together, which chance does in 2 of a hundred cases in which
-# half of them would be as good. On 40 simulated rigs with poses 2 mm and 0.03 degrees off errors then shrink to 0.79
-# of what they were on average, without any gate to 0.77; two standard errors of each move alone leave 0.89, for cameras
-# that stay where they were wrong hold the others back.
+# A move of a millimetre or two, which is what clouds can add to a good pose, is hardly ever proved by itself, and
+# cameras that stay where they were wrong hold the others back. So the moves of a camera and of those that overlap it
+# are proved together, which chance does in 2 of a hundred cases in which half of them would be as good.
 JOINT_SIGMAS = 2.0
 # Its own move must not be spoken against: squared distances, in their variances, must not grow by more than the one,
 # which is as little as one more stray cell, unless that is less than the other of their standard errors. What is asked
-# for proof is asked for this too: at one standard error one right move in twenty would be refused by chance, and a
-# camera that stays where it was wrong holds the others back.
+# for proof is asked for this too: at one standard error chance would refuse right moves now and then, and a camera that
+# stays where it was wrong holds the others back.
 MAX_GROWTH = 2.0
 MAX_GROWTH_SIGMAS = 2.0
 
@@ -129,16 +127,21 @@ class _Trial:
     def unproved(self, moving: Sequence[str]) -> dict[str, CameraMove]:
         """Cameras to keep until held-out distances ask for all moves that are left."""
         refused: dict[str, CameraMove] = {}
-        while failing := self._failing([name for name in moving if name not in refused], tuple(refused)):
+        asked = left = list(moving)
+        # A refusal tells most on cameras that overlap it: first these are asked again, at the end all that are left.
+        while (failing := self._failing(asked, left, tuple(refused))) or len(asked) < len(left):
             # The least proved; of many that fail half at once.
             worst = sorted(failing, key=lambda name: failing[name].gain_sigmas)[: max(1, len(failing) // 2)]
             refused |= {name: failing[name] for name in worst}
+            left = [name for name in left if name not in worst]
+            near = {name for gone in worst for name in self._beside(gone, left)}
+            asked = [name for name in left if not failing or name in failing or name in near]
         return refused
 
-    def _failing(self, left: Sequence[str], away: tuple[str, ...]) -> dict[str, CameraMove]:
-        """Cameras whose move is not proved, while those away are kept already."""
+    def _failing(self, asked: Sequence[str], left: Sequence[str], away: tuple[str, ...]) -> dict[str, CameraMove]:
+        """Cameras whose move is not proved, of those asked about, where some are left and those away kept already."""
         failing: dict[str, CameraMove] = {}
-        for name in left:
+        for name in asked:
             own = self.held.compared((*away, name), away)
             together = self._beside(name, left)
             joint = self.held.compared((*away, *together), away).sigmas
@@ -159,8 +162,11 @@ class _Trial:
     def objected(self, objection: Objection, moving: Sequence[str]) -> CameraMove:
         """A move that something speaks against; of the reference, that all others are moved against it."""
         camera = objection.camera
-        together = moving if camera == self.held.registration.reference else (camera,)
-        return self.move(camera, together, objection.reason, objection.kind)
+        if camera != self.held.registration.reference:
+            return self.move(camera, (camera,), objection.reason, objection.kind)
+        move = self.move(camera, moving, objection.reason, objection.kind)
+        turn_deg, shift_m = objection.wish or (0.0, 0.0)
+        return replace(move, rotation_deg=turn_deg, translation_mm=1e3 * shift_m)
 
     def accepted(self, camera: str, moving: Sequence[str]) -> CameraMove:
         """A move that is kept."""
@@ -190,10 +196,10 @@ class _Trial:
             refusal=refusal,
             rotation_deg=turn_deg,
             translation_mm=1e3 * shift_m,
-            held_out_before_mm=self.held.median_mm(camera, (*away, *together)),
+            held_out_before_mm=self.held.median_mm(camera, away, together),
             held_out_after_mm=self.held.median_mm(camera, away),
             gain_sigmas=self.held.compared((*away, *together), away).sigmas,
-            prior_sigmas=math.nan if camera == reg.reference else prior_sigmas(self.case, reg, camera),
+            prior_sigmas=prior_sigmas(self.case, reg, camera),
             unobservable=reg.unobservable.get(camera, ()),
         )
 

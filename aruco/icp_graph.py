@@ -18,7 +18,7 @@ from loguru import logger
 
 from aruco.errors import InputError
 from aruco.icp_pair import pairwise_icp, quiet_open3d
-from aruco.icp_types import ICPResult
+from aruco.icp_types import ICPResult, Pair
 from aruco.pose_math import (
     Array,
     Pose,
@@ -32,7 +32,6 @@ from aruco.pose_math import (
 
 __all__ = ["apply_gravity_constraint", "build_pose_graph", "graph_order", "optimize_pose_graph", "pairwise_icp"]
 
-Pair = tuple[str, str]
 # An uncertain edge whose clouds stand this far apart counts a quarter; Open3D drops those that count less.
 EDGE_REACH_M = 0.03
 _EDGE_PRUNE_THRESHOLD = 0.25

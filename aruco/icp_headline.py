@@ -6,12 +6,18 @@ Leaves    sentences about single cameras to icp_words, figures to icp_answer.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics, Refusal
 
+# Of wishes to be elsewhere the largest is the cause of the others if it is so many times as large: a camera that was
+# bumped drags those along whose clouds it meets, while a bumped reference turns and shifts all others alike.
+_BY_FAR = 3.0
+# At such a distance [m] a turn shifts what is seen.
+_LEVER_M = 3.0
 # Chi-square with 3 degrees of freedom that chance exceeds once in twenty, as a root.
 FLOOR_SIGMAS_95 = 2.80
 _REASONS: Mapping[Refusal, str] = {
@@ -65,14 +71,45 @@ def _counted(refusals: Iterable[Refusal]) -> str:
 
 def warnings_of(metrics: ICPMetrics, rig: RigParts, config: ICPConfig) -> tuple[str, ...]:
     """What wants to be done about the rig."""
-    elsewhere = {n: m for n, m in sorted(metrics.cameras.items()) if m.refusal in ("prior", "too_far")}
+    elsewhere = {n: m for n, m in sorted(metrics.cameras.items()) if _is_elsewhere(m, config)}
     told = [_bumped(elsewhere, metrics.reference_camera, config)] if elsewhere else []
+    if metrics.num_pairs_attempted and not metrics.num_pairs_converged:
+        told.append(_none_meets(config))
     if len(rig.parts) + len(rig.alone) > 1:
         told.append(_in_parts(rig))
     return tuple(told)
 
 
+def _none_meets(config: ICPConfig) -> str:
+    look = "" if config.global_init else ", or look for cameras that were bumped with --icp-global-init"
+    return (
+        f"Of no two clouds do {100 * config.min_fitness:.0f} % of the points that could meet, so nothing can be learnt "
+        f"from them. See that depth and poses are of the same recording, and that depth is good (--verify-depth){look}."
+    )
+
+
+def _is_elsewhere(move: CameraMove, config: ICPConfig) -> bool:
+    """Whether a camera's cloud asks for a place that the given pose forbids."""
+    if move.refusal in ("prior", "too_far"):
+        return True
+    # Where the cloud does not even fit there, a bump is still likelier than the depth or whatever else was refused.
+    far = move.rotation_deg > config.max_rotation_deg or move.translation_mm > 1e3 * config.max_translation_m
+    return far and move.refusal in ("depth", "misfit")
+
+
+def by_far(moves: Mapping[str, CameraMove]) -> str | None:
+    """The one camera that asks for a move many times as large as any other of these, if there is one."""
+    far = {name: math.radians(m.rotation_deg) * _LEVER_M + 1e-3 * m.translation_mm for name, m in moves.items()}
+    first, *others = sorted(far, key=lambda name: (-far[name], name)) or [""]
+    return first if others and far[first] > _BY_FAR * far[others[0]] else None
+
+
 def _bumped(moves: Mapping[str, CameraMove], reference: str, config: ICPConfig) -> str:
+    first = by_far(moves)
+    if first is not None:
+        others = ", ".join(name for name in moves if name != first)
+        alone = _bumped({first: moves[first]}, reference, config)
+        return f"{alone} {others} would move much less, most likely along with it."
     who, seem, them = ("Camera", "seems", "it") if len(moves) == 1 else ("Cameras", "seem", "them")
     names = ", ".join(f"{name} ({_wish(move)})" for name, move in moves.items())
     do = ["calibrate what was bumped again"]
@@ -80,6 +117,12 @@ def _bumped(moves: Mapping[str, CameraMove], reference: str, config: ICPConfig) 
         do.append("look for its place with --icp-global-init")
     if any(move.refusal == "too_far" for move in moves.values()):
         do.append("allow more with --max-rotation-deg and --max-translation-m")
+    if reference in moves:
+        return (
+            f"{who} {names} {seem} to stand elsewhere than the file says, by as much as in brackets. {reference} is "
+            "the reference, which does not move, so nobody was moved against it; calibrate it again, or rename it so "
+            "that another camera comes first."
+        )
     return (
         f"{who} {names} {seem} to stand elsewhere than the file says, by as much as in brackets, or else the reference "
         f"{reference} does. To move {them} so far was refused; {', or '.join(do)}."
@@ -108,7 +151,8 @@ def remarks_of(metrics: ICPMetrics) -> tuple[str, ...]:
         told.append(
             f"The reference keeps its pose, so the common floor now lies {metrics.floor_tilt_deg:.2f} degrees and "
             f"{1e3 * metrics.floor_rise_m:+.1f} mm off the one the rig was levelled on, more than can be chance "
-            f"({metrics.floor_sigmas:.1f} sigma); levelling the result again, without --icp, mends it."
+            f"({metrics.floor_sigmas:.1f} sigma). refine-ground-plane once more, without --icp, levels the poses; with "
+            "the same depth, covariances then count its floor twice."
         )
     if not metrics.settled:
         told.append(

@@ -14,21 +14,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from aruco.icp_equations import weighted
-from aruco.icp_normal import Normal, scaled_inverse, solved, summed
+from aruco.icp_normal import Normal, derivatives, scaled_inverse, summed
 from aruco.icp_rows import POSE, Index, Rows, followers
 from aruco.icp_solve import Registration
 from aruco.pose_math import Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 N_FOLDS = 4  # shares of the scene that are held out in turn
 # Side of a patch [m]. Depth errors of neighbours, and windows that normals were fitted in, reach 0.1 to 0.2 m at 3 to
 # 4 m: what a patch shares with those around it is its rim.
 PATCH_M = 0.6
-# Patches in which no gap changes by this share of its sigma say nothing, and need not be looked at.
+# Patches in which no gap changes by this share of its sigma say nothing, and need not be looked at. Much larger shares
+# would leave out what in sum decides.
 _CHANGE = 1e-3
 
 
@@ -47,6 +52,25 @@ class Comparison:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """What some rows and what is known beforehand say of all unknowns."""
+
+    x: Array  # (size,)
+    P: Array  # (size, size) covariance
+
+    def way(self, A: Array, b: Array) -> Array:
+        """(size,) from here to the estimate under the constraint ``A x = b``."""
+        return -self._gain(A) @ (A @ self.x - b)
+
+    def bound(self, A: Array, b: Array) -> Estimate:
+        """The estimate under that constraint."""
+        return Estimate(x=self.x + self.way(A, b), P=self.P - self._gain(A) @ (A @ self.P))
+
+    def _gain(self, A: Array) -> Array:
+        return self.P @ A.T @ scaled_inverse(A @ self.P @ A.T)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HeldOut:
     """A registration's rows in shares that are held out in turn."""
 
@@ -54,92 +78,163 @@ class HeldOut:
     patch: Index  # (m,) of the scene, of each row
     fold: Index  # (m,) 0 to N_FOLDS - 1, one for each patch
     without: tuple[Normal, ...]  # of all rows but those of a fold, and of what is known beforehand
-    memo: dict[frozenset[str], Array]
+    J: csr_array  # (m, N_FOLDS * size) of gaps by the unknowns of their own fold's estimate
+    shared: csr_array  # (m, c) of gaps by the errors that they share with others of their patch
+    memo: Memo
 
     def compared(self, before: Collection[str], after: Collection[str]) -> Comparison:
         """Whether gaps shrink from some cameras' standing at their start to fewer cameras' doing so.
 
         The floor's own rows do not count. Both are judged by the same weights, those of the larger gap of each row:
         what loses weight under one solution must not be worth more under the other.
+
+        Args:
+            before: Cameras that stand at their start, those of ``after`` among them.
+            after: Fewer of them.
         """
+        key = frozenset(before), frozenset(after)
+        if key not in self.memo.comparisons:
+            self.memo.comparisons[key] = self._compared(*key)
+        return self.memo.comparisons[key]
+
+    def _compared(self, before: frozenset[str], after: frozenset[str]) -> Comparison:
         reg = self.registration
-        old_x, new_x = self._solutions(before), self._solutions(after)
-        old, new = self._gaps(old_x), self._gaps(new_x)
-        changed = np.abs(old - new) > _CHANGE * np.sqrt(reg.rows.variance)
-        here = ~reg.rows.is_floor & np.isin(self.patch, self.patch[changed])
-        if not here.any():
+        back = self._back(after, before)
+        new, change = self.gaps(after), self._changes(back)
+        old = new + change
+        changed = np.abs(change) > _CHANGE * np.sqrt(reg.rows.variance)
+        here = np.flatnonzero(~reg.rows.is_floor & np.isin(self.patch, self.patch[changed]))
+        if not len(here):
             return Comparison(gain=0.0, share=0.0, sigma=math.inf)
         rows = weighted(reg.rows.only(here), np.maximum(np.abs(old), np.abs(new))[here], reg.scale)
+        # The way counts less where it is doubted; see _doubted.
+        weight = _weighted(rows, self.shared[here], self._changes(self._doubted(back, after))[here])
         patch = np.unique(self.patch[here], return_inverse=True)[1].ravel()
-        way = (old - self._gaps(old_x - self._doubted(old_x - new_x, after)))[here]
-        sums = _sums_by_patch(rows, patch, way, np.stack([old, old - new])[:, here])
+        sums = np.stack([np.bincount(patch, weight * gaps[here]) for gaps in (old, change)], axis=1)
         return compared_scores(sums / reg.scale**2)
 
-    def median_mm(self, camera: str, kept: Collection[str] = ()) -> float:
-        """Median of absolute gaps between one camera's cloud and all others; NaN without any."""
+    def median_mm(self, camera: str, kept: Collection[str] = (), more: Collection[str] = ()) -> float:
+        """Median of absolute gaps between one camera's cloud and all others; NaN without any. See gaps."""
         rows = self.registration.rows
         here = rows.of(self.registration.layout.cameras.index(camera)) & ~rows.is_floor
-        return 1e3 * float(np.median(np.abs(self.gaps(kept)[here]))) if here.any() else float("nan")
+        return 1e3 * float(np.median(np.abs(self.gaps(kept, more)[here]))) if here.any() else float("nan")
 
-    def gaps(self, kept: Collection[str] = ()) -> Array:
+    def gaps(self, kept: Collection[str] = (), more: Collection[str] = ()) -> Array:
         """(m,) gaps [m] that the solution without a row's own share predicts for it.
 
         Args:
             kept: Cameras that stand at their start, relative to the reference, besides those that the registration
                 keeps; their depth errors are estimated.
+            more: More of these, for once.
         """
-        return self._gaps(self._solutions(kept))
-
-    def _gaps(self, solutions: Array) -> Array:
-        reg, gaps = self.registration, np.zeros(len(self.fold))
-        for k, x in enumerate(solutions):
-            here = self.fold == k
-            gaps[here] = reg.rows.only(here).gaps(x, reg.layout)
-        return gaps
-
-    def _solutions(self, kept: Collection[str]) -> Array:
-        """(N_FOLDS, size) the solution without each share."""
         key = frozenset(kept)
-        if key not in self.memo:
-            reg, M = self.registration, self._free(key)
-            x0 = np.zeros(reg.layout.size)
-            for name in {*reg.kept, *key} - {reg.reference}:
-                x0[reg.layout.pose(name)] = reg.back[name]
-            self.memo[key] = np.stack([solved(normal, M, x0) for normal in self.without])
-        return self.memo[key]
+        if key not in self.memo.gaps:
+            x = np.stack([estimate.x for estimate in self._estimates(key)[:N_FOLDS]])
+            self.memo.gaps[key] = self.registration.rows.gap_m + self._changes(x)
+        return self.memo.gaps[key] + self._changes(self._back(key, frozenset(more))) if more else self.memo.gaps[key]
 
-    def _doubted(self, way: Array, kept: Collection[str]) -> Array:
+    def _changes(self, x: Array) -> Array:
+        """(m,) what changes (N_FOLDS, size) of the unknowns without each share make of the gaps in it [m]."""
+        return np.asarray(self.J @ x.ravel())
+
+    def _back(self, kept: frozenset[str], more: frozenset[str]) -> Array:
+        """(N_FOLDS, size) the way from the solutions with some cameras kept to those with more of them."""
+        A, b = self._constraint(more - kept)
+        return np.stack([estimate.way(A, b) for estimate in self._estimates(kept)[:N_FOLDS]])
+
+    def _estimates(self, kept: frozenset[str]) -> tuple[Estimate, ...]:
+        """The estimates without each share, and that of everything, with some cameras kept."""
+        if kept not in self.memo.estimates:
+            if kept:
+                found = tuple(estimate.bound(*self._constraint(kept)) for estimate in self._estimates(frozenset()))
+            else:
+                reg = self.registration
+                found = tuple(_estimate(reg, normal) for normal in (*self.without, reg.clouds + reg.prior))
+            self.memo.estimates[kept] = found
+        return self.memo.estimates[kept]
+
+    def _constraint(self, kept: frozenset[str]) -> tuple[Array, Array]:
+        """(6 k, size), (6 k,) cameras stand at their start, relative to the reference: ``A x = b``."""
+        reg, one = self.registration, np.eye(self.registration.layout.size)
+        names = sorted(kept - {*reg.kept, reg.reference})
+        A = [one[reg.layout.pose(name)] - one[reg.layout.pose(reg.reference)] for name in names]
+        return np.concatenate([one[:0], *A]), np.concatenate([np.zeros(0), *(reg.back[name] for name in names)])
+
+    def _doubted(self, way: Array, kept: frozenset[str]) -> Array:
         """(N_FOLDS, size) a way between solutions, less of it where only the share that is held out knows the way.
 
         A prediction has an error of its own, A C A^T with A the share's rows and C the covariance of what is free
         without the share. With R of the gaps, (R + A C A^T)^-1 A x = R^-1 A y where y = (C^-1 + A^T R^-1 A)^-1 C^-1 x.
         """
-        reg, M = self.registration, self._free(kept)
-        whole = scaled_inverse(M.T @ (reg.clouds.H + reg.prior.H) @ M)
-        free = way @ M / (M * M).sum(axis=0)
-        return np.stack([M @ whole @ (M.T @ (normal.H @ (M @ z))) for normal, z in zip(self.without, free)])
+        whole = self._estimates(kept)[N_FOLDS].P
+        return np.stack([whole @ (normal.H @ x) for normal, x in zip(self.without, way)])
 
-    def _free(self, kept: Collection[str]) -> Array:
-        reg = self.registration
-        return followers(reg.layout, {*reg.kept, *kept} - {reg.reference}, reg.reference, reg.frozen)
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Memo:
+    """What has been found already, by cameras that stand at their start: asked for again and again."""
+
+    estimates: dict[frozenset[str], tuple[Estimate, ...]] = field(default_factory=dict)
+    gaps: dict[frozenset[str], Array] = field(default_factory=dict)
+    comparisons: dict[tuple[frozenset[str], frozenset[str]], Comparison] = field(default_factory=dict)
 
 
 def held_out(registration: Registration, *, seed: int = 0) -> HeldOut:
     """Shares of the scene, drawn by chance, and what the rest of it says."""
-    rows = registration.rows
-    patch = patches(rows)
-    fold = _folds(patch, np.random.default_rng(seed))[patch]
+    patch = patches(registration.rows)
+    return held_out_by(registration, patch, _folds(patch, np.random.default_rng(seed))[patch])
+
+
+def held_out_by(registration: Registration, patch: Index, fold: Index) -> HeldOut:
+    """The same with given shares.
+
+    Args:
+        registration: Of which something is held out.
+        patch: (m,) of the scene, of each of its rows.
+        fold: (m,) 0 to N_FOLDS - 1, one for each patch.
+    """
+    rows, layout = registration.rows, registration.layout
     n_cells = int(max(rows.cell_a.max(initial=-1), rows.cell_b.max(initial=-1))) + 1
+    parts = [summed(rows.only(fold != k), layout, n_cells, scale=registration.scale) for k in range(N_FOLDS)]
     return HeldOut(
         registration=registration,
         patch=patch,
         fold=fold,
-        without=tuple(
-            summed(rows.only(fold != k), registration.layout, n_cells, scale=registration.scale) + registration.prior
-            for k in range(N_FOLDS)
-        ),
-        memo={},
+        without=tuple(part + registration.prior for part in parts),
+        J=_by_fold(derivatives(rows, layout), layout.size, fold),
+        shared=_shared(rows, patch, n_cells),
+        memo=Memo(),
     )
+
+
+def _estimate(registration: Registration, normal: Normal) -> Estimate:
+    """The best of all unknowns but those that are frozen, cameras that the registration keeps being kept."""
+    reg, x0 = registration, np.zeros(registration.layout.size)
+    for name in {*reg.kept} - {reg.reference}:
+        x0[reg.layout.pose(name)] = reg.back[name]
+    M = followers(reg.layout, reg.kept, reg.reference, reg.frozen)
+    P = M @ scaled_inverse(M.T @ normal.H @ M) @ M.T
+    return Estimate(x=x0 - P @ (normal.g + normal.H @ x0), P=P)
+
+
+def _by_fold(J: csr_array, size: int, fold: Index) -> csr_array:
+    """(m, N_FOLDS * size) derivatives (m, size) by what is unknown of each row's own fold."""
+    from scipy.sparse import csr_array
+
+    entries = J.tocoo()
+    row, column = entries.coords
+    return csr_array((entries.data, (row, column + size * fold[row])), shape=(len(fold), N_FOLDS * size))
+
+
+def _shared(rows: Rows, patch: Index, n_cells: int) -> csr_array:
+    """(m, c) of gaps by the errors of cells; a cell that reaches into two patches is one in each. None of the floor."""
+    from scipy.sparse import csr_array
+
+    m = np.flatnonzero(~rows.is_floor)
+    keys = np.concatenate([patch[m] * n_cells + rows.cell_a[m], patch[m] * n_cells + rows.cell_b[m]])
+    found, cell = np.unique(keys, return_inverse=True)
+    errors = np.concatenate([rows.shared_a[m], -rows.shared_b[m]])
+    return csr_array((errors, (np.concatenate([m, m]), cell.ravel())), shape=(len(patch), len(found)))
 
 
 def patches(rows: Rows) -> Index:
@@ -182,23 +277,15 @@ def compared_scores(sums: Array) -> Comparison:
     return Comparison(gain=float(2.0 * score.sum() - total), share=share, sigma=sigma)
 
 
-def _sums_by_patch(rows: Rows, patch: Index, way: Array, gaps: Array) -> Array:
-    """(k, n) sums of way (m,) times gaps (n, m) in their variances, with what rows of a patch share allowed for."""
+def _weighted(rows: Rows, shared: csr_array, way: Array) -> Array:
+    """(m,) a way of gaps (m,) by the inverse of their covariance, what they share (m, c) allowed for."""
     from scipy.sparse import csr_array, eye_array
     from scipy.sparse.linalg import splu
 
-    m = np.arange(len(patch))
     W = 1.0 / (rows.own + rows.variance * (1.0 / rows.weight - 1.0))
-    # A cell that reaches into two patches is one in each.
-    n_cells = int(max(rows.cell_a.max(), rows.cell_b.max())) + 1
-    keys = np.concatenate([patch * n_cells + rows.cell_a, patch * n_cells + rows.cell_b])
-    found, cell = np.unique(keys, return_inverse=True)
-    shared = csr_array(
-        (np.concatenate([rows.shared_a, -rows.shared_b]), (np.concatenate([m, m]), cell.ravel())),
-        shape=(len(m), len(found)),
-    )
+    cells = np.unique(shared.indices)
+    shared = csr_array(shared[:, cells])
     pull = csr_array(shared.multiply(W[:, None])).T.tocsr()
-    A = (eye_array(len(found)) + pull @ shared).tocsc()
+    A = (eye_array(len(cells)) + pull @ shared).tocsc()
     known = splu(A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0).solve(pull @ way)
-    weight = W * way - pull.T @ known
-    return np.stack([np.bincount(patch, weight * some).astype(np.float64) for some in gaps], axis=1)
+    return W * way - pull.T @ known

@@ -44,7 +44,6 @@ def pair_information(
     prior: Array,
     *,
     scale: float,
-    biased: bool,
 ) -> tuple[Array, tuple[str, ...]]:
     """Information (6, 6) of T_target_source, and the directions of which there is less than in the prior.
 
@@ -56,7 +55,6 @@ def pair_information(
         T_world_cam: In the equations' world.
         prior: (6, 6) covariance of the given relative pose, as a twist in the equations' world.
         scale: Factor on noise.
-        biased: Whether depth errors are unknown.
     """
     source, target = pair
     places = layout.cameras.index(source), layout.cameras.index(target)
@@ -64,15 +62,18 @@ def pair_information(
     normal = summed(own, two, n_cells, scale=scale)
     at = two.pose(source)
     H = normal.H[at, at]
-    if biased:
-        both = np.r_[two.bias(source), two.bias(target)]
-        known = np.zeros((8, 8))
-        known[:4, :4] = np.linalg.inv(errors[0])
-        known[4:, 4:] = np.linalg.inv(errors[1])
-        C = normal.H[at, both]
-        H = H - C @ np.linalg.solve(normal.H[np.ix_(both, both)] + known, C.T)
-    Ad = adjoint(T_world_cam[target])
-    words = unobserved(prior, scaled_inverse(H + np.linalg.inv(prior)), T_world_cam[source][:3, 3])
+    both = np.r_[two.bias(source), two.bias(target)]
+    known = np.zeros((8, 8))
+    known[:4, :4] = np.linalg.inv(errors[0])
+    known[4:, 4:] = np.linalg.inv(errors[1])
+    C = normal.H[at, both]
+    H = H - C @ np.linalg.solve(normal.H[np.ix_(both, both)] + known, C.T)
+    Ad, centre = adjoint(T_world_cam[target]), T_world_cam[source][:3, 3]
+    # What the prior ties to a tilt, such as the other camera's times a lever, becomes known with it: clouds alone say
+    # nothing of that.
+    J, back = centre_jacobian(centre), centre_jacobian(centre, inverse=True)
+    apart = back @ np.diag(np.diag(J @ prior @ J.T)) @ back.T
+    words = unobserved(apart, scaled_inverse(H + np.linalg.inv(apart)), centre)
     information = Ad.T @ H @ Ad
     return (information + information.T) / 2, words
 

@@ -21,9 +21,10 @@ from aruco.floor_plane import FloorPlane
 from aruco.icp_agreement import Witness, witness
 from aruco.icp_cloud import cloud_of
 from aruco.icp_global import global_start
+from aruco.icp_headline import by_far
 from aruco.icp_prior import Prior
-from aruco.icp_suspects import Meeting, Pair, agreeing, meetings
-from aruco.icp_types import ICPConfig, ICPMetrics
+from aruco.icp_suspects import Meeting, agreeing, meetings
+from aruco.icp_types import ICPConfig, ICPMetrics, Pair
 from aruco.icp_words import move
 from aruco.pose_math import Pose, pose_distance
 
@@ -90,7 +91,7 @@ def looked_at(
     well = agreeing(frozenset(clouds), met, reference)
     against = {name: _contradicted(name, met, well) for name in sorted(clouds.keys() - well)}
     if not against:
-        logger.info("no camera looks bumped: no two clouds contradict each other")
+        logger.info("no two clouds contradict each other by so much that a camera looks bumped")
         return Looked()
     if reference not in well:
         # To move all others to where they fit it would tilt and shift the world, which they hold rightly.
@@ -115,8 +116,14 @@ def looked_again(
     away = [name for name in away if name != reference and name not in looked.against]
     if not away or looked.reference is not None:
         return looked
+    first = by_far({name: metrics.cameras[name] for name in away})
+    if first is not None:
+        away = [first]
     if len(away) > 1 and len(away) == len(clouds) - 1:
-        logger.info("every camera contradicts its place beside the reference {}, which looks bumped", reference)
+        logger.info(
+            "every pose is contradicted but that of the reference {}, which looks bumped",
+            reference,
+        )
         return Looked(reference=reference, against={reference: tuple(away)})
     taken = {name: T for name, T in looked.found.items() if name not in refused}
     well = frozenset(clouds.keys() - {*away, *(looked.against.keys() - taken.keys())})

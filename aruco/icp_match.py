@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aruco.icp_band import compute_overlap_xz
 from aruco.icp_cloud import Cloud
 from aruco.icp_surface import RADIUS_M
-from aruco.icp_types import ICPConfig
+from aruco.icp_types import ICPConfig, Pair
 from aruco.pose_math import Array, Pose, invert_transform, transform_points
 
 MAX_ANGLE_DEG = 40.0
@@ -46,16 +46,6 @@ class Matches:
     def __len__(self) -> int:
         """How many there are."""
         return len(self.i)
-
-    @property
-    def fitness(self) -> float:
-        """Share of those that could have met that did; 0 where there are none."""
-        return len(self.i) / self.n_candidates if self.n_candidates else 0.0
-
-    @property
-    def rmse(self) -> float:
-        """Root of the mean squared gap [m]; NaN where there is none."""
-        return float(np.sqrt(np.mean(self.gap_m**2))) if len(self.i) else math.nan
 
 
 def match(
@@ -124,7 +114,7 @@ def looked_up(points: Array, target: Cloud) -> tuple[NDArray[np.intp], NDArray[n
 
 def overlapping_pairs(
     clouds: Mapping[str, Cloud], T_world_cam: Mapping[str, Pose], config: ICPConfig
-) -> dict[tuple[str, str], float]:
+) -> dict[Pair, float]:
     """Pairs (a < b) of cameras whose clouds share floor seen from above, and surfaces.
 
     Args:
@@ -133,22 +123,29 @@ def overlapping_pairs(
         config: Least area, margin, and voxel size, four of which and the distance factor are how near surfaces must be.
 
     Returns:
-        Pair -> area [m^2] of compute_overlap_xz. Stray points do not count: boxes reach from the 1st to the 99th
-        percentile.
+        Pair -> area [m^2] of ``shared_areas``.
+    """
+    pairs: dict[Pair, float] = {}
+    for (a, b), area in shared_areas(clouds, T_world_cam, config).items():
+        if area > 0 and area >= config.min_overlap_area:
+            T_b_a = invert_transform(T_world_cam[b]) @ T_world_cam[a]
+            if _meet(clouds[a], clouds[b], T_b_a, config):
+                pairs[a, b] = area
+    return pairs
+
+
+def shared_areas(clouds: Mapping[str, Cloud], T_world_cam: Mapping[str, Pose], config: ICPConfig) -> dict[Pair, float]:
+    """Pair (a < b), of all clouds that are not empty -> area [m^2] of compute_overlap_xz.
+
+    Stray points do not count: boxes reach from the 1st to the 99th percentile.
     """
     boxes = {
         name: np.quantile(transform_points(T_world_cam[name], cloud.points), _BOX_QUANTILES, axis=0)
         for name, cloud in clouds.items()
         if len(cloud)
     }
-    pairs: dict[tuple[str, str], float] = {}
-    for a, b in combinations(sorted(boxes), 2):
-        area = compute_overlap_xz(boxes[a], boxes[b], config.overlap_margin)
-        if area > 0 and area >= config.min_overlap_area:
-            T_b_a = invert_transform(T_world_cam[b]) @ T_world_cam[a]
-            if _meet(clouds[a], clouds[b], T_b_a, config):
-                pairs[a, b] = area
-    return pairs
+    margin = config.overlap_margin
+    return {(a, b): compute_overlap_xz(boxes[a], boxes[b], margin) for a, b in combinations(sorted(boxes), 2)}
 
 
 def _meet(a: Cloud, b: Cloud, T_b_a: Pose, config: ICPConfig) -> bool:

@@ -58,7 +58,7 @@ def summed(rows: Rows, layout: Layout, n_cells: int, *, scale: float = 1.0) -> N
     weighted = csr_array(shared.multiply(W[:, None])).T.tocsr()  # (n_cells, m)
     # Sparse products add up in one order, BLAS in another for each number of threads. And of many cameras each cell
     # meets few.
-    J = _derivatives(rows, layout)
+    J = derivatives(rows, layout)
     WJ = csr_array(J.multiply(W[:, None]))
     H, g, mixed = (J.T @ WJ).toarray(), WJ.T @ rows.gap_m, csr_array(weighted @ J)
     gap = weighted @ rows.gap_m
@@ -75,7 +75,7 @@ def summed(rows: Rows, layout: Layout, n_cells: int, *, scale: float = 1.0) -> N
     return Normal(H=(H + H.T) / 2, g=g, chi2=chi2 / scale**2)
 
 
-def _derivatives(rows: Rows, layout: Layout) -> csr_array:
+def derivatives(rows: Rows, layout: Layout) -> csr_array:
     """(m, size) of gaps by all unknowns."""
     from scipy.sparse import csr_array
 

@@ -1,8 +1,9 @@
 """What speaks against a camera's move, whatever distances between clouds say.
 
-Owns      bounds, depth that cannot be as wrong as it would have to be, clouds that do not fit, the marker prior, the
-          floor; how much each limit is exceeded.
-Leaves    held-out distances to icp_heldout, what happens to the camera to icp_gates, sentences to icp_words.
+Owns      bounds, depth that cannot be as wrong as it would have to be, clouds that do not fit, the marker prior; how
+          much each limit is exceeded.
+Leaves    floors to icp_floor, held-out distances to icp_heldout, what happens to the camera to icp_gates, sentences to
+          icp_words.
 
 A wrong depth, a wrong match or a camera that was bumped after its markers were seen brings clouds nearer to each other
 as well as a right move does: where all of a cloud is wrong, so is what was held out of it.
@@ -18,12 +19,13 @@ import numpy as np
 
 from aruco import icp_words as words
 from aruco.floor_model import centre_jacobian
-from aruco.floor_plane import FloorPlane, plane_axes
+from aruco.floor_plane import FloorPlane
 from aruco.icp_cloud import Cloud
+from aruco.icp_floor import MAX_COMMON_TILT_DEG, common_tilts_deg, floor_growth
 from aruco.icp_prior import Prior
 from aruco.icp_solve import Registration
 from aruco.icp_types import ICPConfig, Refusal
-from aruco.pose_math import Array, Pose, exp_so3, invert_transform, log_se3, log_so3, make_pose, pose_distance
+from aruco.pose_math import Array, Pose, exp_so3, invert_transform, log_so3, make_pose, pose_distance
 
 # Chi-square that is exceeded once in a thousand, by degrees of freedom.
 CHI2_999 = {4: 18.47, 6: 22.46}
@@ -34,14 +36,6 @@ _LEAST_TOLD = 0.25
 # evenly over 28 mm where noise is 6 mm, make it 3.4.
 MAX_MISFIT = 3.0
 _MEDIAN_SIGMAS = 0.6745  # of a normal distribution
-# A camera's own floor may be worse by this and three sigma of what it knows of it: a move that is right in all else is
-# not refused for what depth cannot tell.
-MAX_TILT_GROWTH_DEG = 0.1
-MAX_RISE_GROWTH_M = 0.003
-FLOOR_SIGMAS = 3.0
-# The reference does not move, so where its own tilt was wrong the common floor leans in the world returned. Levelling
-# by biased depth leaves up to 0.3 degrees of that on simulated rigs; beyond half a degree no world is level.
-MAX_COMMON_TILT_DEG = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,19 +57,23 @@ class Objection:
     kind: Refusal
     excess: float  # how many times the limit
     reason: str
+    wish: tuple[float, float] | None = None  # turn [deg] and shift [m] from the given pose, where that is against it
 
 
 def worst_objection(case: Case, registration: Registration, moving: Sequence[str]) -> Objection | None:
     """The objection that exceeds its limit most: to what is wrong with a cloud first, then to where cameras are put.
 
-    A cloud that is wrong takes other cameras along, and they are not to be blamed for it.
+    A cloud that is wrong takes other cameras along, and they are not to be blamed for it. But a camera that was bumped
+    makes its cloud look wrong.
     """
     clouds = (registration.reference, *moving) if moving else ()
     to_clouds = [o for name in clouds for o in _to_cloud(case, registration, name, moving)]
     to_clouds = to_clouds or list(to_all_depths(case, registration, clouds))
-    found = to_clouds or [
-        *(o for name in clouds for o in _to_size(case, registration, name)),
-        *(o for name in moving for o in _to_pose(case, registration, name)),
+    to_poses = [*_to_prior(case, registration, moving), *_to_size(case, registration, moving)]
+    bumped = [o for o in to_poses if o.camera in {objection.camera for objection in to_clouds}]
+    found = [*to_clouds, *bumped] or [
+        *to_poses,
+        *(o for name in moving for o in _to_floor(case, registration, name)),
         *_to_common_floor(case, registration, moving),
     ]
     return max(found, key=lambda objection: objection.excess) if found else None
@@ -86,27 +84,47 @@ def _to_cloud(case: Case, registration: Registration, camera: str, moving: Seque
     yield from _to_fit(registration, camera, moving)
 
 
-def _to_pose(case: Case, registration: Registration, camera: str) -> Iterator[Objection]:
-    yield from _to_prior(case, registration, camera)
-    yield from _to_floor(case, registration, camera)
+def _to_size(case: Case, registration: Registration, moving: Sequence[str]) -> Iterator[Objection]:
+    """To the camera without which the others agree best, if it went too far; else to such a one of these others.
+
+    How far it went says less: what others do in common is a mean that the one which strayed has a part in, and where
+    one turns in place that takes a distant camera along. Of two cameras it is never the reference, which nobody knows.
+    """
+    left = [registration.reference, *moving]
+    while len(left) > 1 and max((excess := _beyond(case, registration, left)).values()) > 1:
+        without = {name: _beyond(case, registration, [n for n in left if n != name]) for name in left}
+        strayed = min(left, key=lambda name: (max(without[name].values()), name == registration.reference))
+        if excess[strayed] > 1:
+            turn_deg, shift = _against(case, registration, left, strayed)
+            reason = words.too_far(turn_deg, shift, case.config.max_rotation_deg, case.config.max_translation_m)
+            yield Objection(camera=strayed, kind="too_far", excess=excess[strayed], reason=reason)
+            return
+        left.remove(strayed)
 
 
-def _to_size(case: Case, registration: Registration, camera: str) -> Iterator[Objection]:
-    turn, shift = against_others(case.start, registration.T_world_cam, camera)
-    config, turn_deg = case.config, math.degrees(turn)
-    excess = max(turn_deg / config.max_rotation_deg, shift / config.max_translation_m)
-    if excess > 1:
-        reason = words.too_far(turn_deg, shift, config.max_rotation_deg, config.max_translation_m)
-        yield Objection(camera=camera, kind="too_far", excess=excess, reason=reason)
+def _beyond(case: Case, registration: Registration, cameras: Sequence[str]) -> dict[str, float]:
+    """How many times its bounds each of some cameras is off what these do in common."""
+    moves = {name: _against(case, registration, cameras, name) for name in cameras}
+    most_deg, most_m = case.config.max_rotation_deg, case.config.max_translation_m
+    return {name: max(turn_deg / most_deg, shift / most_m) for name, (turn_deg, shift) in moves.items()}
+
+
+def _against(case: Case, registration: Registration, cameras: Sequence[str], camera: str) -> tuple[float, float]:
+    """A camera's turn [deg] and shift [m] beyond what others of some cameras do in common."""
+    T_before, T_after = ({name: T[name] for name in cameras} for T in (case.start, registration.T_world_cam))
+    turn, shift = against_others(T_before, T_after, camera)
+    return math.degrees(turn), shift
 
 
 def against_others(T_before: Mapping[str, Pose], T_after: Mapping[str, Pose], camera: str) -> tuple[float, float]:
     """How far a camera turns [rad] and its centre moves [m] beyond what the others do in common.
 
     The reference does not move, so all cameras swing about it when it was turned itself: by centimetres for a degree,
-    and none of them is to be blamed for it.
+    and none of them is to be blamed for it. By itself a camera goes nowhere.
     """
     others = [name for name in sorted(T_after) if name != camera]
+    if not others:
+        return 0.0, 0.0
     turns = [log_so3(T_after[name][:3, :3] @ T_before[name][:3, :3].T) for name in others]
     R = exp_so3(np.mean(turns, axis=0))
     old, new = (np.mean([T[name][:3, 3] for name in others], axis=0) for T in (T_before, T_after))
@@ -146,8 +164,6 @@ def _depth_surprise(case: Case, registration: Registration, cameras: Sequence[st
 
     Once by what is believed of any camera, and once by what the estimate takes for it less what clouds leave unknown.
     """
-    if not case.config.depth_bias:
-        return 0.0
     at = np.concatenate([np.r_[registration.layout.bias(name)] for name in cameras])
     stated = np.zeros((len(at), len(at)))
     believed = stated.copy()
@@ -190,40 +206,61 @@ def _to_fit(registration: Registration, camera: str, moving: Sequence[str]) -> I
         yield Objection(camera=camera, kind="misfit", excess=misfit / MAX_MISFIT, reason=reason)
 
 
-def _to_prior(case: Case, registration: Registration, camera: str) -> Iterator[Objection]:
-    size = prior_sigmas(case, registration, camera)
+def _to_prior(case: Case, registration: Registration, moving: Sequence[str]) -> Iterator[Objection]:
+    """To the camera whose given pose fits the estimate least, if it is beyond what its covariance allows.
+
+    One wrong pose pulls all others off theirs, each in proportion to what is known of it: those are not to be blamed.
+    Of each pose is asked how far the estimate of all is from it, in what that may be by chance (Baarda, A testing
+    procedure for use in geodetic networks, 1968). Of two cameras the reference stays, for nobody knows which it is.
+    """
     limit = math.sqrt(CHI2_999[6])
-    if size > limit:
-        turn, shift = pose_distance(case.start[camera], registration.T_world_cam[camera])
-        reason = words.against_prior(math.degrees(turn), shift, size, limit)
-        yield Objection(camera=camera, kind="prior", excess=size / limit, reason=reason)
+    asked = [registration.reference, *moving] if len(moving) > 1 else list(moving)
+    given = [name for name in asked if case.priors[name].covariance is not None]
+    off = {name: _Off.from_prior(case, registration, name) for name in given}
+    beyond = {name: by for name, by in off.items() if by.sigmas > limit}
+    if beyond:
+        worst = max(beyond, key=lambda name: (beyond[name].by_chance, name != registration.reference))
+        by = beyond[worst]
+        reason = words.against_prior(*by.size, by.sigmas, limit)
+        yield Objection(camera=worst, kind="prior", excess=by.sigmas / limit, reason=reason, wish=by.size)
 
 
 def prior_sigmas(case: Case, registration: Registration, camera: str) -> float:
-    """How far a camera is from its given pose, relative to the reference, in standard deviations (6 numbers together).
-
-    Once by the covariance given, and once by what the estimate takes for it less what clouds leave unknown: a wish
-    against the prior is one even where half of it was granted. The larger counts; NaN where nothing was given.
-    """
-    reference = registration.reference
-    priors = {name: case.priors[name] for name in (reference, camera)}
-    if any(prior.covariance is None for prior in priors.values()):
-        return math.nan
-    given = {name: _at_centre(prior.moved(np.eye(4)), priors[camera]) for name, prior in priors.items()}
-    T_expected = case.start[reference] @ invert_transform(priors[reference].T_world_cam) @ priors[camera].T_world_cam
-    twist = log_se3(registration.T_world_cam[camera] @ invert_transform(T_expected))
-    off = centre_jacobian(T_expected[:3, 3]) @ twist
-    believed = sum((registration.scales.given**2 * S for name, S in given.items()), np.zeros((6, 6)))
-    told = believed - registration.pair_covariance(reference, camera)
-    stated = given[reference] + given[camera]
-    return math.sqrt(max(surprise(off, stated, stated), surprise(off, believed, told)))
+    """How far the estimate puts a camera from its given pose, in standard deviations; NaN where nothing was given."""
+    known = case.priors[camera].covariance is not None
+    return _Off.from_prior(case, registration, camera).sigmas if known else math.nan
 
 
-def _at_centre(prior: Prior, camera: Prior) -> Array:
-    """(6, 6) of a prior, as (turn, shift) of the centre of a camera."""
-    J = centre_jacobian(camera.T_world_cam[:3, 3])
-    assert prior.covariance is not None
-    return J @ prior.covariance @ J.T
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Off:
+    """How far the estimate of all cameras, none of which it takes for a reference, puts one from its given pose."""
+
+    size: tuple[float, float]  # turn [deg] and shift of the centre [m]
+    by_stated: float  # root of chi-square (6 numbers together) by the covariance given
+    by_chance: float  # by what the estimate takes for it less what clouds leave unknown
+
+    @property
+    def sigmas(self) -> float:
+        """A wish against the prior is one even where half of it was granted: the larger counts."""
+        return max(self.by_stated, self.by_chance)
+
+    @staticmethod
+    def from_prior(case: Case, registration: Registration, camera: str) -> _Off:
+        """Of a camera whose pose has a covariance."""
+        at, prior = registration.layout.pose(camera), case.priors[camera]
+        T_own_cam = invert_transform(registration.T_out_own) @ registration.T_world_cam[camera]
+        own, given = centre_jacobian(T_own_cam[:3, 3]), centre_jacobian(prior.T_world_cam[:3, 3])
+        S = np.linalg.inv(registration.prior.H[at, at])
+        off = own @ S @ registration.prior.g[at]
+        stated = prior.moved(np.eye(4)).covariance
+        assert stated is not None
+        stated = given @ stated @ given.T
+        told = own @ (S - registration.joint[at, at]) @ own.T
+        return _Off(
+            size=(math.degrees(float(np.linalg.norm(off[:3]))), float(np.linalg.norm(off[3:]))),
+            by_stated=math.sqrt(surprise(off, stated, stated)),
+            by_chance=math.sqrt(surprise(off, own @ S @ own.T, told)),
+        )
 
 
 def surprise(wish: Array, before: Array, told: Array) -> float:
@@ -243,70 +280,39 @@ def surprise(wish: Array, before: Array, told: Array) -> float:
 
 
 def _to_floor(case: Case, registration: Registration, camera: str) -> Iterator[Objection]:
-    """To a camera that would stand on another floor than all: as it sees it, its depth error taken out.
+    """To a camera that would stand on another floor than all.
 
     The common floor is that of the estimate. The reference does not move, so when its own depth proves wrong the floor
     lies elsewhere under it, and all cameras with it.
     """
-    after_plane = _own_floor(case.clouds[camera], registration.bias[camera])
-    before_plane = _own_floor(case.clouds[camera], np.zeros_like(registration.bias[camera]))
-    if case.floor is None or registration.floor is None or after_plane is None or before_plane is None:
+    if case.floor is None or registration.floor is None:
         return
-    a, noise = after_plane
-    after = _off_floor(a, registration.T_world_cam[camera], registration.floor)
-    before = _off_floor(before_plane[0], case.start[camera], case.floor)
-    sigma_tilt_deg, sigma_m = _floor_sigmas(a, noise)
-    limits = (MAX_TILT_GROWTH_DEG + FLOOR_SIGMAS * sigma_tilt_deg, MAX_RISE_GROWTH_M + FLOOR_SIGMAS * sigma_m)
-    excess = max((after[k] - before[k]) / limits[k] for k in range(2))
-    if excess > 1:
-        yield Objection(camera=camera, kind="floor", excess=excess, reason=words.floor_worse(before, after))
-
-
-def _own_floor(cloud: Cloud, bias: Array) -> tuple[Array, Array] | None:
-    """A camera's floor ``1 / z = a . r`` (3,) with a depth error taken out, and the covariance (3, 3) of its noise."""
-    here = np.flatnonzero(cloud.is_floor)
-    if cloud.floor is None or len(here) < 3:
-        return None
-    depth = cloud.depth_m[here] + bias @ cloud.slopes[:, here]
-    root = depth**2 / cloud.sigma_m[here]  # of the weight of an inverse depth
-    a = np.linalg.lstsq(cloud.rays[here] * root[:, None], root / depth, rcond=None)[0]
-    return a, cloud.floor.noise
-
-
-def _off_floor(a: Array, T_world_cam: Pose, floor: FloorPlane) -> tuple[float, float]:
-    """Angle [deg] of a camera's plane with a floor, and how far it is off it [m] below the camera."""
-    length = float(np.linalg.norm(a))
-    tilt_deg = _tilt_deg(-T_world_cam[:3, :3] @ a, floor.normal)
-    return tilt_deg, abs(float(floor.distances(T_world_cam[:3, 3])) - 1.0 / length)
-
-
-def _floor_sigmas(a: Array, noise: Array) -> tuple[float, float]:
-    """Standard deviations of a plane's angle [deg] and distance [m]."""
-    h = 1.0 / float(np.linalg.norm(a))
-    normal = -a * h
-    tilt = h**2 * np.trace(plane_axes(normal) @ noise @ plane_axes(normal).T)
-    return math.degrees(math.sqrt(float(tilt))), h**2 * math.sqrt(float(normal @ noise @ normal))
+    growth = floor_growth(
+        case.clouds[camera],
+        registration.bias[camera],
+        before=(case.start[camera], case.floor),
+        after=(registration.T_world_cam[camera], registration.floor),
+    )
+    if growth is not None and growth.excess > 1:
+        reason = words.floor_worse(growth.before, growth.after)
+        yield Objection(camera=camera, kind="floor", excess=growth.excess, reason=reason)
 
 
 def _to_common_floor(case: Case, registration: Registration, moving: Sequence[str]) -> Iterator[Objection]:
     """To the camera that turns most."""
     if case.floor is None or registration.floor is None or not moving:
         return
-    up = np.asarray(case.config.up, dtype=np.float64)
-    before, after = (_tilt_deg(plane.normal, up) for plane in (case.floor, registration.floor))
-    # Where the reference was not level itself the world cannot be: it stays.
-    reference = registration.reference
-    seen = _own_floor(case.clouds[reference], registration.bias[reference])
-    if seen is not None:
-        before = max(before, _tilt_deg(-case.start[reference][:3, :3] @ seen[0], up))
+    reference, up = registration.reference, np.asarray(case.config.up, dtype=np.float64)
+    before, after = common_tilts_deg(
+        (case.floor, registration.floor),
+        up,
+        case.clouds[reference],
+        registration.bias[reference],
+        case.start[reference],
+    )
     excess = (after - before) / MAX_COMMON_TILT_DEG
     if excess > 1:
         turned = {name: pose_distance(case.start[name], registration.T_world_cam[name])[0] for name in moving}
         worst = max(turned, key=lambda name: turned[name])
         reason = words.common_floor_tilts(before, after)
         yield Objection(camera=worst, kind="floor", excess=excess, reason=reason)
-
-
-def _tilt_deg(normal: Array, up: Array) -> float:
-    """Angle of a normal of any length with up."""
-    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(normal, up))), float(normal @ up)))

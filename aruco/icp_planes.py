@@ -48,8 +48,8 @@ _VOTERS = 2000
 _LOOSE_M = 0.04
 # A plane is fitted to what lies on it so often.
 _ROUNDS = 3
-# Directions of windows on a plane differ from its own by 0.5 to 1 of their sigmas, on a cylinder of 0.2 m by 1.4 and
-# more. Walls may bend, and errors of depth may reach farther than a window: where they are small, noise is no measure.
+# Directions of windows on a plane differ from its own by hardly more than their sigmas, on what bends by more. Walls
+# may bend, and errors of depth may reach farther than a window: where they are small, noise is no measure.
 _FLAT = 1.25
 _FLAT_LARGE = 2.0
 _HARDLY_RAD = math.radians(1.0)

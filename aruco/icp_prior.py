@@ -1,14 +1,14 @@
 """What is known before clouds are compared: poses and depth errors.
 
-Owns      Prior, its normal equations in parts whose sizes are not certain.
+Owns      Prior, its normal equations, and its parts whose sizes are not certain.
 Leaves    these sizes to icp_evidence, what clouds say to icp_equations.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -30,7 +30,6 @@ _DEFAULT_SIGMA = np.array([DEFAULT_TURN_RAD] * 3 + [DEFAULT_SHIFT_M] * 3)
 # No covariance is believed beyond this: tripods creep, lenses breathe, and it keeps the equations solvable.
 LEAST_TURN_RAD = math.radians(0.005)
 LEAST_SHIFT_M = 0.0002
-Term = tuple[slice, Array, Array]  # where some unknowns stand, their information, how far they are from their mean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,6 +38,7 @@ class Prior:
 
     T_world_cam: Pose
     covariance: Array | None = None  # (6, 6) left perturbation in world axes; None: nobody has said
+    scaled: bool = True  # by the factor that is common to all covariances, and told by all
 
     def moved(self, T_new_old: Pose) -> Prior:
         """The same in another world, with a covariance that can be inverted."""
@@ -47,7 +47,7 @@ class Prior:
             return Prior(T_world_cam=T)
         back = centre_jacobian(T[:3, 3], inverse=True)
         least = back @ np.diag([LEAST_TURN_RAD**2] * 3 + [LEAST_SHIFT_M**2] * 3) @ back.T
-        return Prior(T_world_cam=T, covariance=Ad @ self.covariance @ Ad.T + least)
+        return replace(self, T_world_cam=T, covariance=Ad @ self.covariance @ Ad.T + least)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,10 +67,19 @@ def default_of(aspect: str, camera: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Part:
-    """Normal equations of unknowns whose standard deviations share a factor, at a factor of one."""
+    """Unknowns whose standard deviations share a factor: ``rows @ x + off`` has variance one at a factor of one."""
 
-    normal: Normal
-    n: int  # unknowns
+    rows: Array  # (n, size)
+    off: Array  # (n,) at x = 0
+
+    @classmethod
+    def joined(cls, parts: Sequence[Part]) -> Part:
+        """All of several that share a factor."""
+        return cls(rows=np.vstack([part.rows for part in parts]), off=np.concatenate([part.off for part in parts]))
+
+    def scaled(self, factor: float) -> Part:
+        """The same with standard deviations times a factor."""
+        return Part(rows=self.rows / factor, off=self.off / factor)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,8 +100,10 @@ class Known:
 
     def covariance(self, camera: str, scales: Scales) -> Array:
         """(6, 6) of a camera's given pose."""
-        S = self.poses[camera].covariance
-        return self._default(camera, scales) if S is None else scales.given**2 * S
+        prior = self.poses[camera]
+        if prior.covariance is None:
+            return self._default(camera, scales)
+        return prior.covariance * (scales.given**2 if prior.scaled else 1.0)
 
     def _default(self, camera: str, scales: Scales) -> Array:
         sigma = _DEFAULT_SIGMA.copy()
@@ -114,43 +125,55 @@ class Known:
 
     def normal(self, state: State, scales: Scales) -> Normal:
         """Its normal equations."""
-        poses = [(self.layout.pose(c), self.covariance(c, scales), self.off(state, c)) for c in self.layout.cameras]
-        biases = [(self.layout.bias(c), self.bias_covariance(c, scales), state.bias[c]) for c in self.layout.cameras]
-        return self._summed([(at, np.linalg.inv(S), off) for at, S, off in (*poses, *biases)])
-
-    def parts(self, state: State) -> dict[str, Part]:
-        """Each aspect of each pose without a covariance, poses with one, depth errors, lean, and what is measured."""
-        groups: dict[str, list[Term]] = {}
-        for c in self.layout.cameras:
-            for group, term in (*self._of_pose(state, c), *self._of_bias(state, c)):
-                groups.setdefault(group, []).append(term)
-        return {
-            name: Part(normal=self._summed(terms), n=sum(int(np.linalg.matrix_rank(W)) for _, W, _ in terms))
-            for name, terms in groups.items()
-        }
-
-    def _of_pose(self, state: State, camera: str) -> Iterator[tuple[str, Term]]:
-        """What is known of a camera's pose, by the names of its parts."""
-        at, off, S = self.layout.pose(camera), self.off(state, camera), self.poses[camera].covariance
-        if S is not None:
-            yield "given", (at, np.linalg.inv(S), off)
-            return
-        J = centre_jacobian(self.poses[camera].T_world_cam[:3, 3])
-        for aspect, components in ASPECTS.items():
-            rows = (J / _DEFAULT_SIGMA[:, None])[list(components)]
-            yield default_of(aspect, camera), (at, rows.T @ rows, off)
-
-    def _of_bias(self, state: State, camera: str) -> Iterator[tuple[str, Term]]:
-        """Likewise of its depth error."""
-        S, b, k = self.bias_covariance(camera, Scales()), state.bias[camera], self.layout.bias(camera).start
-        yield "measured" if self.measured(camera) else "bias", (slice(k, k + 2), np.linalg.inv(S[:2, :2]), b[:2])
-        yield "lean", (slice(k + 2, k + 4), np.linalg.inv(S[2:, 2:]), b[2:])
-
-    def _summed(self, terms: Iterable[Term]) -> Normal:
         size = self.layout.size
         H, g, chi2 = np.zeros((size, size)), np.zeros(size), 0.0
-        for at, W, off in terms:
-            H[at, at] += (W + W.T) / 2
-            g[at] += W @ off
-            chi2 += float(off @ W @ off)
+        for c in self.layout.cameras:
+            for at, S, off in (
+                (self.layout.pose(c), self.covariance(c, scales), self.off(state, c)),
+                (self.layout.bias(c), self.bias_covariance(c, scales), state.bias[c]),
+            ):
+                W = np.linalg.inv(S)
+                H[at, at] = (W + W.T) / 2
+                g[at] = W @ off
+                chi2 += float(off @ W @ off)
         return Normal(H=H, g=g, chi2=chi2)
+
+    def parts(self, state: State, kept: Collection[str] = ()) -> dict[str, Part]:
+        """Each aspect of each pose without a covariance, poses with one, depth errors, lean, and what is certain.
+
+        Poses of kept cameras are left out: they were put where they are, so that they are there is no testimony for how
+        well poses are known.
+        """
+        groups: dict[str, list[Part]] = {}
+        for c in self.layout.cameras:
+            for group, part in (*(() if c in kept else self._of_pose(state, c)), *self._of_bias(state, c)):
+                groups.setdefault(group, []).append(part)
+        return {name: Part.joined(parts) for name, parts in groups.items()}
+
+    def _of_pose(self, state: State, camera: str) -> Iterator[tuple[str, Part]]:
+        """What is known of a camera's pose, by the names of its parts."""
+        at, off, prior = self.layout.pose(camera), self.off(state, camera), self.poses[camera]
+        if prior.covariance is not None:
+            yield "given" if prior.scaled else "certain", self._part(at, _root(prior.covariance), off)
+            return
+        J = centre_jacobian(prior.T_world_cam[:3, 3]) / _DEFAULT_SIGMA[:, None]
+        for aspect, components in ASPECTS.items():
+            yield default_of(aspect, camera), self._part(at, J[list(components)], off)
+
+    def _of_bias(self, state: State, camera: str) -> Iterator[tuple[str, Part]]:
+        """Likewise of its depth error."""
+        S, b, k = self.bias_covariance(camera, Scales()), state.bias[camera], self.layout.bias(camera).start
+        name = "certain" if self.measured(camera) else "bias"
+        yield name, self._part(slice(k, k + 2), _root(S[:2, :2]), b[:2])
+        yield "lean", self._part(slice(k + 2, k + 4), _root(S[2:, 2:]), b[2:])
+
+    def _part(self, at: slice, root: Array, off: Array) -> Part:
+        """Of unknowns that are ``off`` their mean, the information of which is ``root.T @ root``."""
+        rows = np.zeros((len(root), self.layout.size))
+        rows[:, at] = root
+        return Part(rows=rows, off=root @ off)
+
+
+def _root(S: Array) -> Array:
+    """A matrix R of which R.T @ R is the inverse of a covariance."""
+    return np.linalg.inv(np.linalg.cholesky(S))

@@ -197,7 +197,8 @@ def _common_floor(floor_planes: Mapping[str, FloorPlane], poses: Mapping[str, Po
     planes = [floor_planes[name] for name in sorted(floor_planes)]
     if not planes:
         return None
-    normal = np.mean([plane.normal for plane in planes], axis=0)
+    # Medians: the plane of a camera that was bumped may be among them.
+    normal = np.median([plane.normal for plane in planes], axis=0)
     normal /= np.linalg.norm(normal)
     middle = np.mean([T[:3, 3] for T in poses.values()], axis=0)
     above_m = float(np.median([plane.distances(middle[None])[0] for plane in planes]))
@@ -248,7 +249,7 @@ def _refined(given: Given, part: tuple[str, ...], pairs: Mapping[Pair, float]) -
 
     def again(kept: Collection[str], silent: Collection[str] = ()) -> Registration:
         # A cloud that is set aside may have been why errors were thought to be large.
-        scales = everything.scales if kept and not silent else None
+        scales = first.scales if kept and not silent else None
         return _registered(given, *set_aside(clouds, good, silent), kept, scales)
 
     first = everything if len(good) == len(within) else again(())

@@ -22,10 +22,10 @@ from aruco.icp_information import PairInformation, fit_of, pair_information, uno
 from aruco.icp_match import Matches
 from aruco.icp_normal import Normal, scaled_inverse
 from aruco.icp_prior import Prior, Scales
-from aruco.icp_rows import Layout, Rows, followers
+from aruco.icp_rows import POSE, Layout, Rows, followers
 from aruco.icp_steps import Fit, Pair, Setup, fitted, set_up
 from aruco.icp_types import ICPConfig
-from aruco.pose_math import Array, Pose, invert_transform, log_se3
+from aruco.pose_math import Array, Pose, adjoint, invert_transform, log_se3
 from aruco.uncertainty import carried
 
 __all__ = ["Normal", "PairInformation", "Prior", "Registration", "register"]
@@ -37,7 +37,7 @@ class Registration:
 
     T_world_cam: dict[str, Pose]  # the reference's and kept ones exactly as at the start
     bias: dict[str, Array]  # (4,) beyond the given one; see icp_cloud.Cloud.slopes
-    bias_covariance: dict[str, Array]  # (4, 4)
+    bias_covariance: dict[str, Array]  # (4, 4), other cameras standing where they stand
     covariance: dict[str, Array]  # (6, 6) of the poses returned, left perturbation in world axes
     reference: str
     kept: tuple[str, ...]  # asked to be kept, or without overlap with the reference's part of the rig
@@ -55,7 +55,7 @@ class Registration:
     clouds: Normal  # of all rows
     prior: Normal  # of poses and depth errors, without clouds
     frozen: Mask  # (size,) unknowns that are not estimated
-    joint: Array  # (size, size) covariance of all unknowns, the reference as free as the others
+    joint: Array  # (size, size) covariance of all unknowns, were the reference and kept cameras as free as the others
     back: dict[str, Array]  # camera -> (6,) twist that takes it to its start, relative to the reference
     T_out_own: Pose  # from the equations' world to the returned one
 
@@ -98,8 +98,7 @@ def register(
         reference: The camera that does not move.
         kept: Cameras that do not move either.
         begin: Camera -> T_world_cam where the estimate begins for it in place of its start, if it is free to move.
-        scales: How large errors of poses and depth are; None: clouds tell. With cameras kept they would be told of a
-            part of the rig.
+        scales: How large errors of poses and depth are; None: clouds tell, of poses by cameras that are free.
         start_covariances: Camera -> (6, 6) of its pose in ``start``, of depth too where that made it, for what is told
             of cameras that stay; default: that of the prior.
     """
@@ -128,12 +127,13 @@ def _answer(setup: Setup, fit: Fit, start: Mapping[str, Pose], areas: Mapping[Pa
     joint = free @ scaled_inverse(free.T @ (fit.clouds.H + prior.H) @ free) @ free.T
     T_restored = setup.start.T_world_cam[reference] @ invert_transform(T[reference])
     T_out_own = invert_transform(setup.T_own_world) @ T_restored
+    returned = _returned(setup, fit, joint, T_restored)
     still = {reference, *setup.kept}
     return Registration(
         T_world_cam={name: start[name] if name in still else T_out_own @ T[name] for name in layout.cameras},
         bias=fit.state.bias,
-        bias_covariance={name: joint[layout.bias(name), layout.bias(name)] for name in layout.cameras},
-        covariance=_covariances(setup, fit, joint, T_restored),
+        bias_covariance={name: returned[layout.bias(name), layout.bias(name)] for name in layout.cameras},
+        covariance=_covariances(setup, fit, returned),
         reference=reference,
         kept=setup.kept,
         floor=fit.state.plane.moved(T_out_own) if setup.floors else None,
@@ -158,25 +158,48 @@ def _answer(setup: Setup, fit: Fit, start: Mapping[str, Pose], areas: Mapping[Pa
     )
 
 
-def _covariances(setup: Setup, fit: Fit, joint: Array, T_restored: Pose) -> dict[str, Array]:
-    """(6, 6) of the poses returned: as clouds and priors know them, but for standing where the reference stood.
+def _returned(setup: Setup, fit: Fit, joint: Array, T_restored: Pose) -> Array:
+    """(size, size) of what is returned, in the own world: brought to where the reference and kept cameras stand.
 
-    The estimate's error x and that of where the reference was at the start, e, have E[x e^T] = the joint covariance's
-    block, for the start is made of less than the estimate is. Moved back by e - x of the reference, a camera has the
-    covariance P_cc + S_r - P_rr: what the reference's start is worse than estimated. A kept camera is known as it was
-    at the start.
+    With A x how far the cameras that stay are off their places beside the reference, their being forced there takes
+    G = P A^T (A P A^T)^-1 of their errors at the start, e, to all others, and the world's being moved back takes those
+    of the reference, R. So an error x becomes x + K (e - x) with K = (1 - R) G A + R. The start is made of less than
+    the estimate is, so E[x e^T] = P, and what comes out has the covariance P + K (S - P) K^T: what the start is worse
+    than estimated. That a pose was kept because no better one was proved does not make it any better.
     """
-    P = {
-        name: carried(joint[at, at], T_restored)
-        for name, at in ((name, setup.layout.pose(name)) for name in setup.layout.cameras)
-    }
-    P_r = P[setup.reference]
-    worse = _at_least(_start_covariance(setup, fit, setup.reference), P_r) - P_r
+    layout, reference = setup.layout, setup.reference
+    poses = [layout.pose(name) for name in layout.cameras]
+    Ad = np.eye(layout.size)
+    R = np.zeros_like(Ad)
+    for at in poses:
+        Ad[at, at], R[at, layout.pose(reference)] = adjoint(T_restored), np.eye(POSE)
+    P = Ad @ joint @ Ad.T
+    still = (reference, *setup.kept)
+    here = np.concatenate([np.r_[layout.pose(name)] for name in still])
+    S = np.zeros((len(here), len(here)))
+    for k, name in enumerate(still):
+        at = slice(POSE * k, POSE * (k + 1))
+        S[at, at] = _start_covariance(setup, fit, name)
+    K = R
+    if setup.kept:
+        one = np.eye(layout.size)
+        A = np.vstack([one[layout.pose(name)] - one[layout.pose(reference)] for name in setup.kept])
+        GA = P @ A.T @ scaled_inverse(A @ P @ A.T) @ A
+        K = GA - R @ GA + R
+    P_here = P[np.ix_(here, here)]
+    worse = _at_least(S, P_here) - P_here
+    S_out: Array = P + K[:, here] @ worse @ K[:, here].T
+    return (S_out + S_out.T) / 2
+
+
+def _covariances(setup: Setup, fit: Fit, returned: Array) -> dict[str, Array]:
+    """(6, 6) of the poses returned; a camera that stays is known as it was at the start."""
     out: dict[str, Array] = {}
     for name in setup.layout.cameras:
+        at = setup.layout.pose(name)
         stays = name in (setup.reference, *setup.kept)
         S = carried(
-            _start_covariance(setup, fit, name) if stays else P[name] + worse, invert_transform(setup.T_own_world)
+            _start_covariance(setup, fit, name) if stays else returned[at, at], invert_transform(setup.T_own_world)
         )
         out[name] = (S + S.T) / 2
     return out
@@ -216,7 +239,6 @@ def _pair(setup: Setup, fit: Fit, pair: Pair, area_m2: float) -> PairInformation
         fit.state.T_world_cam,
         setup.known.covariance(source, fit.scales) + setup.known.covariance(target, fit.scales),
         scale=fit.noise,
-        biased=setup.config.depth_bias,
     )
     fitness, rmse, n_points = fit_of(fit.matches[source, target], fit.matches[target, source])
     return PairInformation(

@@ -6,7 +6,7 @@ Leaves    rows to icp_equations, their sum to icp_normal, what the end of the wa
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,11 +20,11 @@ from aruco.icp_normal import Normal, scaled_inverse, solved, summed
 from aruco.icp_prior import Known, Prior, Scales
 from aruco.icp_rows import BIAS, Layout, Rows, followers
 from aruco.icp_smooth import corrected, smoothed
-from aruco.icp_types import VOXELS, ICPConfig
+from aruco.icp_starts import contradiction, other_starts
+from aruco.icp_types import VOXELS, ICPConfig, Pair
 from aruco.pose_math import Array, Pose, invert_transform, make_pose
 from aruco.uncertainty import carried
 
-Pair = tuple[str, str]
 # At each of the scales VOXELS, of how many samples one is looked up: neighbours share their errors anyway.
 _EVERY = (4, 4, 2)
 # Steps below this share of a standard deviation are none.
@@ -94,8 +94,6 @@ def set_up(
     floors = () if plane is None else tuple(name for name in names if clouds[name].is_floor.any())
     frozen = np.zeros(layout.size, dtype=bool)
     frozen[layout.floor] = not floors
-    for name in () if config.depth_bias else names:
-        frozen[layout.bias(name)] = True
     stay = tuple(sorted(({*kept} | {*names} - _reachable(reference, pairs)) - {reference}))
     about = {name: smoothed(clouds[name]) for name in names}
     at_start = State(
@@ -104,7 +102,7 @@ def set_up(
         floor=np.zeros(3) if plane is None else floor_parameters(plane, up),
         up=up,
     )
-    elsewhere = {name: T_own_world @ T for name, T in (begin or {}).items() if name not in (reference, *stay)}
+    elsewhere = {name: T_own_world @ T for name, T in (begin or {}).items() if name in {*names} - {reference, *stay}}
     return Setup(
         layout=layout,
         reference=reference,
@@ -130,19 +128,38 @@ def set_up(
 
 
 def fitted(setup: Setup) -> Fit:
-    """The most probable state, from coarse matches to fine ones."""
-    fit = _met(setup, setup.begin, setup.told or Scales(), scale=0)
-    rounds, settled, last = 0, False, len(VOXELS) - 1
-    for scale, most in enumerate(setup.config.max_iterations):
-        steps: list[float] = []
-        over = False
-        while not over:
-            moved, step = _stepped(setup, fit)
-            steps.append(step)
-            over = _is_over(steps, most)
-            fit = _met(setup, moved.state, moved.scales, scale=min(scale + over, last))
-        rounds, settled = rounds + len(steps), steps[-1] < _TO_AND_FRO
-    return replace(fit, rounds=rounds, settled=settled)
+    """The most probable state: a coarse way from each start, and on from the best of their ends to the finest scale."""
+    ways = [_gone(setup, _met(setup, start, setup.told or Scales(), scale=0), 0) for start in _starts(setup)]
+    fit = min(ways, key=lambda way: contradiction(way.rows, way.matches))
+    for scale in range(1, len(VOXELS)):
+        fit = _gone(setup, fit, scale)
+    return fit
+
+
+def _starts(setup: Setup) -> Iterator[State]:
+    begin = setup.begin
+    yield begin
+    free = tuple(name for name in setup.layout.cameras if name not in (setup.reference, *setup.kept))
+    finest = _reach(setup.config, len(VOXELS) - 1)
+    for T_world_cam in other_starts(setup.known, begin.T_world_cam, free, finest, seed=setup.config.seed):
+        yield replace(begin, T_world_cam=T_world_cam)
+
+
+def _gone(setup: Setup, fit: Fit, scale: int) -> Fit:
+    """One estimate after another on one scale, until it stays; met at the end as on the next one."""
+    steps: list[float] = []
+    rounds, over = fit.rounds, False
+    while not over:
+        state, scales, step = _stepped(setup, fit)
+        steps.append(step)
+        over = _is_over(steps, setup.config.max_iterations[scale])
+        fit = _met(setup, state, scales, scale=min(scale + 1, len(VOXELS) - 1) if over else scale)
+    return replace(fit, rounds=rounds + len(steps), settled=steps[-1] < _TO_AND_FRO)
+
+
+def _reach(config: ICPConfig, scale: int) -> float:
+    """How far apart on a scale what meets may be [m]."""
+    return VOXELS[scale] * config.voxel_size * config.max_correspondence_distance_factor
 
 
 def _is_over(steps: Sequence[float], most: int) -> bool:
@@ -154,7 +171,7 @@ def _is_over(steps: Sequence[float], most: int) -> bool:
 def _met(setup: Setup, state: State, scales: Scales, *, scale: int) -> Fit:
     """What meets at a state, and the equations about it."""
     every = _EVERY[scale]
-    reach = VOXELS[scale] * setup.config.voxel_size * setup.config.max_correspondence_distance_factor
+    reach = _reach(setup.config, scale)
     about = {name: corrected(setup.clouds[name], setup.surfaces[name], b) for name, b in state.bias.items()}
     seen, surfaces = {name: cloud for name, (cloud, _) in about.items()}, {n: depth for n, (_, depth) in about.items()}
     some = {name: _every(cloud, every) for name, cloud in seen.items()}
@@ -175,16 +192,16 @@ def _met(setup: Setup, state: State, scales: Scales, *, scale: int) -> Fit:
     return Fit(state=state, scales=scales, rows=rows, n_cells=n_cells, noise=noise, clouds=clouds, matches=matches)
 
 
-def _stepped(setup: Setup, fit: Fit) -> tuple[Fit, float]:
-    """The best state of the linear equations, and how far it is in standard deviations."""
-    M, known = setup.M, setup.known
-    scales = setup.told or told_scales(known, fit.state, fit.clouds, M, fit.scales, biased=setup.config.depth_bias)
-    total = fit.clouds + known.normal(fit.state, scales)
+def _stepped(setup: Setup, fit: Fit) -> tuple[State, Scales, float]:
+    """The best state of the linear equations, by what scales, and how far it is in standard deviations."""
+    M = setup.M
+    scales = setup.told or told_scales(setup.known, fit.state, fit.clouds, M, fit.scales, kept=setup.kept)
+    total = fit.clouds + setup.known.normal(fit.state, scales)
     x = solved(total, M)
     sigma = np.sqrt(np.diag(scaled_inverse(M.T @ total.H @ M)))
     z = M.T @ x / np.maximum(np.diag(M.T @ M), 1.0)
     step = float(np.max(np.abs(z) / np.maximum(sigma, 1e-12), initial=0.0))
-    return replace(fit, state=fit.state.moved(x, setup.layout), scales=scales), step
+    return fit.state.moved(x, setup.layout), scales, step
 
 
 def _every(cloud: Cloud, step: int) -> Cloud:

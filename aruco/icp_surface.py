@@ -34,8 +34,8 @@ _LEAST_SHARE = 0.25
 # Squares that lie farther off the plane of their surroundings are chance hits of the matcher.
 _OUTLIER = 4.0
 # A window reaches across a crease before its misfit shows it: beside a surface that faces elsewhere nothing is
-# taken, 5 px at the focal length of 720p. On furnished rooms this and the limit of sigma take the error of
-# registration from 8.8 to 3.4 mm; 8 px are as good there, and leave too little of small things elsewhere.
+# taken, 5 px at the focal length of 720p: such normals are wrong alike in many samples, which no weight makes good.
+# A wider strip would leave too little of small things.
 _CREASE_RAD = 5.0 / 700.0
 _CREASE_COSINE = math.cos(math.radians(25.0))
 

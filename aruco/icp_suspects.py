@@ -1,12 +1,16 @@
 """Cameras whose clouds contradict the others' by more than poses and depth are off.
 
-Owns      contradictions between pairs of clouds, the most cameras that agree among themselves, who contradicts them.
-Leaves    where the others stand to icp_global.
+Owns      contradictions between pairs of clouds, the most cameras that agree among themselves, who contradicts them;
+          whether a camera that was found elsewhere fits there as well as cameras do that were never in doubt.
+Leaves    where the others stand to icp_global; held-out distances, bounds and the floor to icp_gates, which judges a
+          place first.
 
-A surface that another camera looks through is a contradiction, however well clouds meet elsewhere. In ten simulated
-rooms full of furniture up to 20 of 100 samples of a camera that stands well contradict the others, at the edges of
-things (of a pair of cameras now and then 70), and after a bump of 18 degrees and 0.35 m 80 and more, in a room with two
-boxes 58. Bumps below 5 degrees may pass.
+A surface that another camera looks through is a contradiction, however well clouds meet elsewhere. Cameras that stand
+well contradict each other too, at the edges of things; after a bump of many degrees most samples do. Small bumps pass:
+they are the business of the gates.
+
+Gates compare a place with where the camera stood before, and nearly any place is better than that, even one where most
+samples contradict other clouds. At right places hardly one does once the depth errors estimated there are taken out.
 """
 
 from __future__ import annotations
@@ -18,20 +22,24 @@ from itertools import combinations
 
 import numpy as np
 
+from aruco import icp_words as words
 from aruco.floor_model import centre_jacobian
 from aruco.icp_agreement import MOST_ANGLE_DEG, Witness, gaps
 from aruco.icp_prior import DEFAULT_SHIFT_M, DEFAULT_TURN_RAD, Prior
+from aruco.icp_types import ICPMetrics, Pair
 from aruco.pose_math import Array, Pose, invert_transform
 
-Pair = tuple[str, str]
 # What windows and voxels of a few centimetres make of edges.
 _BLUR_M = 0.03
 # Depth and poses may be off by so many of their sigmas.
 _SIGMAS = 3.0
 # Of samples that meet or contradict, at least so many must before they count, and so large a share must contradict:
-# midway, in odds, between the 20 and the 58 of 100 above.
+# midway, in odds, between the fifth that edges may make of a crowded room and the majority after a bump.
 LEAST_SAMPLES = 20
 MOST_AGAINST = 0.37
+# Contradictions that are left at the edges of things, of what could meet, or as many as other cameras have among
+# themselves where people walk about; never as many as of a bumped one.
+MOST_LEFT = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,3 +153,30 @@ def together(some: Iterable[Meeting]) -> Meeting:
 
 def _pair(met: Mapping[Pair, Meeting], a: str, b: str) -> Meeting:
     return met.get((min(a, b), max(a, b)), Meeting(met=0, against=0))
+
+
+def doubt_about(
+    camera: str, clouds: Mapping[str, Witness], T_world_cam: Mapping[str, Pose], metrics: ICPMetrics
+) -> str:
+    """What speaks against a found place, in words; empty: nothing.
+
+    Args:
+        camera: Which.
+        clouds: Camera -> its cloud, the depth bias of this answer taken out.
+        T_world_cam: Poses of this answer.
+        metrics: Of this answer, in which the camera was moved.
+    """
+    unclear = metrics.cameras[camera].unobservable
+    if unclear:
+        return words.unclear(unclear)
+    sure = {name: Prior(T_world_cam=T, covariance=np.zeros((6, 6))) for name, T in T_world_cam.items()}
+    met = meetings(clouds, T_world_cam, sure)
+    others = [_share(name, {pair: m for pair, m in met.items() if camera not in pair}) for name in clouds]
+    most = min(max([MOST_LEFT, *others]), MOST_AGAINST)
+    own = _share(camera, met)
+    return words.contradicts_there(own, most) if own > most else ""
+
+
+def _share(camera: str, met: Mapping[Pair, Meeting]) -> float:
+    """Of a camera's samples that contradict any other."""
+    return together(m for pair, m in met.items() if camera in pair).share

@@ -14,6 +14,7 @@ from aruco.depth_bias import DepthBias
 from aruco.errors import InputError
 from aruco.pose_math import Array, Pose
 
+Pair = tuple[str, str]  # of cameras, in their order: source and target
 Method = Literal["point_to_plane", "gicp"]
 Region = Literal["floor", "hybrid", "full"]
 METHODS: tuple[Method, ...] = ("point_to_plane", "gicp")
@@ -52,13 +53,14 @@ class ICPConfig:
     min_fitness: float = 0.3  # of the points that could have met, those that did
     min_overlap_area: float = 1.0  # [m^2] on the floor; pairs with less are not looked at
     overlap_margin: float = 0.5  # [m]
-    gravity_penalty_weight: float = 10.0  # see apply_gravity_constraint
+    # For callers of apply_gravity_constraint; refine_with_icp does not read it and weighs tilt by covariances.
+    gravity_penalty_weight: float = 10.0
     max_correspondence_distance_factor: float = 1.4  # times the voxel
     max_rotation_deg: float = 5.0  # of one camera, beyond the motion that the others have in common
     max_translation_m: float = 0.1  # likewise, of its centre
     _: KW_ONLY
     region: Region = "hybrid"  # floor: the band; hybrid: the band and what stands upright; full: everything
-    depth_bias: bool = True  # estimate each camera's depth bias together with the poses
+    depth_bias: bool = True  # tell each camera's depth bias; else it is only allowed for, as one more uncertainty
     global_init: bool = False  # look for cameras that were bumped, from features instead of the given pose
     stride: int = 4  # every so many rows and columns of the depth
     seed: int = 0
@@ -96,12 +98,14 @@ class ICPResult:
     converged: bool
     _: KW_ONLY
     overlap_m2: float = math.nan
-    n_points: int = 0  # of the source that met the target
+    # Of the source that met the target: of all that is left of voxels (pairwise_icp), or of every second sample, which
+    # are those that refine_with_icp looks up.
+    n_points: int = 0
     rotation_deg: float = 0.0  # how much the pair was turned against each other from where it stood
     translation_mm: float = 0.0
     unobservable: tuple[str, ...] = ()  # directions of which the pair says nothing, in words
     verdict: str = ""
-    overlaps: bool = True  # else it was not looked at
+    overlaps: bool = True  # else too little is shared, or no surface, and it was not looked at
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,12 +130,12 @@ class CameraMove:
 class ICPMetrics:
     """What was tried and done."""
 
-    success: bool = False
+    success: bool = False  # it could run; so it did where every pose was kept
     num_pairs_attempted: int = 0
     num_pairs_converged: int = 0
     num_cameras_optimized: int = 0  # took part in the joint adjustment, the reference among them
     num_disconnected: int = 0
-    per_pair_results: dict[tuple[str, str], ICPResult] = field(default_factory=dict)  # of all pairs of clouds
+    per_pair_results: dict[Pair, ICPResult] = field(default_factory=dict)  # of all pairs of clouds
     reference_camera: str = ""
     message: str = ""
     _: KW_ONLY

@@ -32,6 +32,9 @@ from aruco.pose_math import Array
 # Windows may reach over what is dropped at an edge, but not to what is measured beyond: the mask's margin on both
 # sides of the jump, less some pixels for jumps that are not straight.
 _BEYOND_EDGE_PX = 10.0
+# No bias is measured so well that this part of what is usual is not left: depth wanders with the temperature, and with
+# none at all, or a correlation of one, equations have no solution.
+LEAST_BIAS = 0.005
 # Independent measurements of the changing noise in a correlation cell of the fixed one.
 _PER_CELL = (CORRELATION_PX / TEMPORAL_CORRELATION_PX) ** 2
 
@@ -80,7 +83,7 @@ def usable_view(camera: str, data: Mapping[str, Any], stride: int, bias: DepthBi
     unit = 1.0 / (focal_baseline or DEFAULT_FOCAL_BASELINE)
     prior = bias_prior(focal_baseline, "stereo" if bias is None else bias.model)
     covariance = np.diag([0.0, 0.0, (LEAN_PX * unit) ** 2, (LEAN_PX * unit) ** 2])
-    covariance[:2, :2] = prior if bias is None or bias.covariance is None else bias.covariance
+    covariance[:2, :2] = prior if bias is None or bias.covariance is None else bias.covariance + LEAST_BIAS**2 * prior
     samples = FloorSamples(
         camera=camera,
         pixels=squares.pixels,

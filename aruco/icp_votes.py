@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from aruco.pose_math import Array, Pose, exp_so3, make_pose
 
-# Pairs that are drawn; of true ones two in a thousand are left where one match in twenty is right.
+# Pairs that are drawn; of true ones two in a thousand are left where only one match in twenty is right.
 _PAIRS = 400_000
 # Two places must lie this far apart to tell a turn: 6 cm of error over 0.5 m are 7 degrees, over 2 m below 2.
 _LEAST_APART_M = 0.5

@@ -7,14 +7,14 @@ Leaves    registering to aruco.icp_registration, when and with what to icp_refin
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from aruco.depth_bias import DepthBias
-from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics, ICPResult
+from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics, ICPResult, Pair
 from aruco.pose_math import Array, Pose, invert_transform, pose_text
 from rigcal import __version__
 from rigcal.ground_note import DepthFile
@@ -40,12 +40,13 @@ class Registration:
     def new_bias(self) -> dict[str, DepthBias]:
         """The biases that go with the new poses: of the cameras that were moved, and of those they were moved against.
 
-        Where a pose was refused, the bias estimated beside it was refused with it.
+        Where a pose was refused, the bias estimated beside it was refused with it; and a reference of a part of the rig
+        in which nobody moved has stood beside refused poses only.
         """
-        if not self.moved:
-            return {}
+        moved = set(self.moved)
         stood = {name for name, move in self.metrics.cameras.items() if move.refusal == "reference"}
-        goes = {*self.moved, *stood, self.metrics.reference_camera}
+        stood.add(self.metrics.reference_camera)
+        goes = moved | (stood & _linked(moved, self.metrics.per_pair_results))
         return {name: bias for name, bias in sorted(self.metrics.biases.items()) if name in goes}
 
     @property
@@ -111,6 +112,15 @@ def icp_note(given: RigFile, source: DepthFile, registration: Registration) -> d
             "inputs_sha256": {"extrinsics": given.digest, "depth": source.digest},
         },
     }
+
+
+def _linked(cameras: Collection[str], results: Mapping[Pair, ICPResult]) -> set[str]:
+    """These cameras, and those that lead to them over pairs that meet."""
+    meet = [{*pair} for pair, result in results.items() if result.converged]
+    found = set(cameras)
+    while new := set().union(*(pair for pair in meet if pair & found)) - found:
+        found |= new
+    return found
 
 
 def _motion(registration: Registration, name: str) -> Pose:

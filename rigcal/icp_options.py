@@ -36,7 +36,8 @@ _OPTIONS = (
                  help="What takes part: the floor and what lies just above it, that and whatever stands upright, or "
                       "everything."),
     click.option("--icp-depth-bias/--no-icp-depth-bias", default=True, show_default=True,
-                 help="Estimate each camera's depth bias together with the poses, and write it."),
+                 help="Write each camera's depth bias, which is estimated together with the poses; else it is only "
+                      "allowed for."),
     click.option("--icp-global-init", is_flag=True,
                  help="Also look for cameras that were bumped, by what their clouds look like: up to 30 degrees and "
                       "0.6 m from where they are said to stand, or as far as --max-rotation-deg and "

@@ -6,7 +6,7 @@ Leaves    registering to aruco.icp_registration, layouts to icp_note.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -77,21 +77,32 @@ def _registered(levelling: Levelling, config: ICPConfig) -> tuple[dict[str, Pose
     if not metrics.success:
         nothing_moved = {name: replace(move, accepted=False) for name, move in metrics.cameras.items()}
         return start, replace(metrics, cameras=nothing_moved)
+    if void := sorted(levelling.metrics.doubts.odd.keys() & levelling.given.covariance.keys()):
+        metrics = replace(metrics, remarks=(*metrics.remarks, _forgotten(void)))
     # A camera that was not accepted keeps its levelled pose to the bit.
     return {name: found[name] if name in metrics.moved else T for name, T in start.items()}, metrics
+
+
+def _forgotten(names: Sequence[str]) -> str:
+    poses, it = ("poses", "they are") if len(names) > 1 else ("pose", "it is")
+    return (
+        f"The floor contradicts the given {poses} of {', '.join(names)} by far more than covariances allow; they were "
+        f"forgotten, and clouds told how far off {it}."
+    )
 
 
 def _known(levelling: Levelling) -> Mapping[str, Array]:
     """(6, 6) of the marker poses in the levelled world, left perturbation in its axes, without what the floor knows.
 
     The floor takes part in the registration and would count twice; so levelling tells only how much worse poses are
-    than they say. Where the file says nothing the clouds tell: floors that agree say nothing of yaw, x and z.
+    than they say. Where the file says nothing the clouds tell: floors that agree say nothing of yaw, x and z. Of a
+    camera that the floor contradicts where others agree nothing is known any more. Were its pose believed, clouds would
+    pull at all others, and its own move be refused for being against what is known of it.
     """
     metrics, given = levelling.metrics, levelling.given.covariance
     known: dict[str, Array] = {}
-    for name in levelling.T_before_cam:
+    for name in sorted(given.keys() - metrics.doubts.odd.keys()):
         scale = metrics.pose_scales.get(name)
-        if name in given:
-            at_least = max(1.0, 1.0 if scale is None else scale)
-            known[name] = at_least**2 * carried(np.asarray(given[name]), metrics.T_level_world)
+        at_least = max(1.0, 1.0 if scale is None else scale)
+        known[name] = at_least**2 * carried(np.asarray(given[name]), metrics.T_level_world)
     return known

@@ -23,7 +23,7 @@ from rigcal.kept import kept_of
 
 # No rig is that far from its target; in millimetres it is.
 FAR_M = 200.0
-# Figures of a camera that judge the pose which markers gave it, not the one that the floor has corrected.
+# Figures of a camera that judge the pose which markers gave it, not the one that the floor or clouds have corrected.
 _OF_MARKERS = ("rms_px", "spread_mm", "spread_deg")
 
 
@@ -139,6 +139,7 @@ def levelled_content(
     doubts: GroundDoubts,
     *,
     corrected: Collection[str],
+    registered: Collection[str] = (),
 ) -> dict[str, Any]:
     """The content of the levelled file: all of the given one, but for what levelling has changed.
 
@@ -148,10 +149,16 @@ def levelled_content(
         covariance: Of these, (6, 6); only cameras that the file had one of are written.
         note: ``_meta.ground_refined``.
         doubts: What the floor contradicts.
-        corrected: Cameras that were moved beyond the motion common to all.
+        corrected: Cameras that were moved by the floor, beyond the motion common to all.
+        registered: Cameras that were moved by clouds after that.
     """
     entries = {
-        name: _entry(given.content[name], T, doubts.cameras.get(name), corrected=name in corrected)
+        name: _entry(
+            given.content[name],
+            T,
+            doubts.cameras.get(name),
+            since="before_levelling" if name in corrected else "before_icp" if name in registered else None,
+        )
         for name, T in sorted(T_world_cam.items())
     }
     world = given.meta.get("world")
@@ -171,15 +178,22 @@ def levelled_content(
 
 
 def _entry(
-    entry: Mapping[str, Any], T_world_cam: Pose, contradiction: str | None, *, corrected: bool
+    entry: Mapping[str, Any], T_world_cam: Pose, contradiction: str | None, *, since: str | None
 ) -> dict[str, Any]:
-    """A camera's entry without what the new pose makes untrue, and with what the floor says against it."""
+    """A camera's entry without what the new pose makes untrue, and with what the floor says against it.
+
+    Args:
+        entry: As given.
+        T_world_cam: New pose.
+        contradiction: What the floor says against it.
+        since: Where figures of markers go: by the step that moved the camera first; None: only the whole rig moved.
+    """
     # A kept camera is no longer where its old file has it; what was least known of a pose the floor may know well.
-    untrue = {"kept", "least_known", *_OF_MARKERS} if corrected else {"kept"}
+    untrue = {"kept", "least_known", *_OF_MARKERS} if since else {"kept"}
     new = {**{key: value for key, value in entry.items() if key not in untrue}, "pose": pose_text(T_world_cam)}
     of_markers = {key: entry[key] for key in _OF_MARKERS if key in entry}
-    if corrected and of_markers:
-        new["before_levelling"] = of_markers
+    if since and of_markers:
+        new[since] = of_markers
     told = entry.get("warnings")
     if contradiction is not None:
         new["warnings"] = [*(told if isinstance(told, list) else []), contradiction]

@@ -101,9 +101,14 @@ class Levelling:
                 self.given, self.T_world_cam, self.covariance, self.note, self.doubts, corrected=corrected
             )
         covariance = found.covariance(self.covariance)
-        corrected = [*corrected, *found.moved]
         content = levelled_content(
-            self.given, found.T_world_cam, covariance, self.note, self.doubts, corrected=corrected
+            self.given,
+            found.T_world_cam,
+            covariance,
+            self.note,
+            self.doubts,
+            corrected=corrected,
+            registered=found.moved,
         )
         return registered_content(content, found, note)
 

@@ -7,7 +7,7 @@ Leaves    the floor and corrections on it to aruco.ground_plane, the files to le
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -85,11 +85,18 @@ def _warn_of_input(given: RigFile, store: Mapping[str, CameraDepth], source: Dep
     blind = sorted(n for n in store.keys() & given.T_world_cam.keys() if not np.isfinite(store[n].depth).any())
     if blind:
         logger.warning(
-            "depth of cameras {} holds no measurement; they are moved with the whole rig only", ", ".join(blind)
+            "depth of {} holds no measurement; only the motion of the whole rig moves {}",
+            _cameras(blind),
+            "it" if len(blind) == 1 else "them",
         )
     unknown = sorted(store.keys() - given.T_world_cam.keys() - set(given.apart))
     if unknown:
-        logger.warning("depth of cameras {} is not used: {} has no pose of them", ", ".join(unknown), given.name)
+        them = "it" if len(unknown) == 1 else "them"
+        logger.warning("depth of {} is not used: {} has no pose of {}", _cameras(unknown), given.name, them)
+
+
+def _cameras(names: Sequence[str]) -> str:
+    return f"camera{'s' * (len(names) > 1)} {', '.join(names)}"
 
 
 def _on_floor(

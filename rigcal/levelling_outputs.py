@@ -93,9 +93,11 @@ def _write_all(contents: Mapping[Path, bytes]) -> None:
 
 def _page(levelling: Levelling) -> str:
     world = {"up_y": levelling.up_y, "floor_y": levelling.floor_y}
-    found, more = levelling.registration, ()
+    found, more, above = levelling.registration, (), levelling.facts
     if found is not None:
         sheets = sheets_of(found.metrics, levelling.T_world_cam.keys(), found.given_bias, found.new_bias.keys())
         facts = (found.fact, *found.metrics.warnings)
         more = icp_section(levelling.clouds(), sheets, remarks_of(found.metrics), facts, **world)
-    return floor_page(levelling.views(), levelling.figures, levelling.facts, **world, more=more)
+        # What asks for something to be done is read at the top.
+        above = (*above, "What follows is the rig before its clouds were registered; that stands below.", *facts)
+    return floor_page(levelling.views(), levelling.figures, above, **world, more=more)

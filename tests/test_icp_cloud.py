@@ -283,7 +283,8 @@ def test_what_is_not_known_of_the_bias_is_the_prior_or_as_measured():
     assert np.sqrt(np.diag(free)[2:]) == pytest.approx([LEAN_PX / FOCAL_BASELINE] * 2)
     known = DepthBias(scale=1e-3, covariance=np.diag([1e-6, 1e-8]))
     cloud = cloud_of("cam0", camera_data(depth), FULL, T_world_cam=CAM, floor=LEVEL, bias=known)
-    assert cloud.bias_covariance[:2, :2] == pytest.approx(np.diag([1e-6, 1e-8]))
+    # But for the little that is never known.
+    assert cloud.bias_covariance[:2, :2] == pytest.approx(np.diag([1e-6, 1e-8]), rel=0.01)
 
 
 def test_a_world_with_y_down_gives_the_same_cloud():

@@ -13,6 +13,7 @@ import pytest
 from aruco.icp_headline import (
     FLOOR_SIGMAS_95,
     RigParts,
+    by_far,
     message_of,
     reference_of_part,
     remarks_of,
@@ -69,6 +70,39 @@ def test_a_camera_that_stands_elsewhere_is_warned_of_with_what_to_do(refusal: Re
     assert "), d (" in of_two
 
 
+def test_of_several_that_stand_elsewhere_the_one_by_far_is_named() -> None:
+    small, large = ({"rotation_deg": 0.06, "translation_mm": 5.0}, {"rotation_deg": 0.34, "translation_mm": 39.0})
+    b, c, d = kept("prior", **small), kept("prior", **large), kept("prior", **small)
+    (warning,) = warnings_of(metrics(b=b, c=c, d=d), ONE_PART, ICPConfig())
+    assert warning.startswith("Camera c (0.34 degrees and 39 mm")
+    assert warning.endswith("b, d would move much less, most likely along with it.")
+    assert by_far({"b": b, "c": c, "d": d}) == "c"
+    # Others that ask for about as much may be right, and the reference wrong.
+    half = kept("prior", rotation_deg=0.2, translation_mm=20.0)
+    assert by_far({"b": half, "c": c}) is None
+    assert by_far({}) is None
+    assert by_far({"c": c}) is None
+
+
+@pytest.mark.parametrize("refusal", ["depth", "misfit"])
+def test_a_move_beyond_the_bounds_is_warned_of_whatever_it_was_refused_for(refusal: Refusal) -> None:
+    far, near = (kept(refusal, rotation_deg=deg, translation_mm=50.0) for deg in (12.3, 0.5))
+    (warning,) = warnings_of(metrics(b=far), ONE_PART, ICPConfig())
+    assert "Camera b (12.30 degrees" in warning
+    assert not warnings_of(metrics(b=near), ONE_PART, ICPConfig())
+
+
+def test_clouds_that_overlap_and_do_not_meet_are_warned_of() -> None:
+    nothing = dataclasses.replace(metrics(b=kept("unlinked")), num_pairs_converged=0)
+    (warning,) = warnings_of(nothing, ONE_PART, ICPConfig(min_fitness=0.4))
+    assert "40 %" in warning
+    assert "--icp-global-init" in warning
+    (looked,) = warnings_of(nothing, ONE_PART, ICPConfig(global_init=True))
+    assert "--icp-global-init" not in looked
+    # Where nothing overlaps the message says it.
+    assert not warnings_of(dataclasses.replace(nothing, num_pairs_attempted=0), ONE_PART, ICPConfig())
+
+
 def test_a_rig_in_parts_is_warned_of() -> None:
     found = metrics(b=MOVED, c=kept("unproved"))
     assert not warnings_of(found, ONE_PART, ICPConfig())
@@ -83,7 +117,9 @@ def test_a_floor_that_lies_otherwise_is_remarked_only_beyond_chance() -> None:
     beyond = dataclasses.replace(metrics(b=MOVED), floor_sigmas=1.1 * FLOOR_SIGMAS_95, **off)
     (remark,) = remarks_of(beyond)
     assert "0.12 degrees and -4.3 mm" in remark
-    assert "levelling the result again" in remark
+    # As the warning of levelling again with the same depth has it.
+    assert "once more, without --icp" in remark
+    assert "count its floor twice" in remark
     assert not remarks_of(dataclasses.replace(beyond, floor_sigmas=0.9 * FLOOR_SIGMAS_95))
     assert not remarks_of(dataclasses.replace(beyond, floor_sigmas=math.nan))
     # Where nothing moved the floor is where levelling has put it.

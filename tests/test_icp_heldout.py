@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aruco.icp_gates import JOINT_SIGMAS, MAX_GROWTH, MAX_GROWTH_SIGMAS
-from aruco.icp_heldout import N_FOLDS, Comparison, HeldOut, compared_scores
+from aruco.icp_heldout import N_FOLDS, Comparison, HeldOut, compared_scores, held_out_by
 from aruco.icp_normal import Normal, summed
 from aruco.icp_rows import PER_CAMERA, Layout, Rows
 from aruco.icp_solve import Registration
@@ -124,8 +124,7 @@ def shifted(rng: np.random.Generator) -> HeldOut:
         back={"cam1": np.zeros(6)},
         scale=1.0,
     )
-    without = tuple(summed(rows.only(fold != k), PAIR, 2 * len(n)) + prior for k in range(N_FOLDS))
-    return HeldOut(registration=cast(Registration, registration), patch=patch, fold=fold, without=without, memo={})
+    return held_out_by(cast(Registration, registration), patch, fold)
 
 
 def drawn(n: int) -> list[Comparison]:

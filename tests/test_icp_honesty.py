@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -17,6 +17,7 @@ from aruco.floor_model import centre_jacobian
 from aruco.icp_cloud import Cloud, cloud_of
 from aruco.icp_match import overlapping_pairs
 from aruco.icp_normal import scaled_inverse, summed
+from aruco.icp_prior import Scales
 from aruco.icp_solve import Prior, Registration, register
 from aruco.icp_types import ICPConfig
 from aruco.pose_math import Array, Pose, adjoint, exp_so3, invert_transform, log_se3, make_pose
@@ -61,7 +62,7 @@ def start(rng: np.random.Generator) -> dict[str, Pose]:
     }
 
 
-def registered(seed: int) -> Registration:
+def registered(seed: int, kept: Sequence[str] = (), scales: Scales | None = None) -> Registration:
     rng = np.random.default_rng(seed)
     given = start(rng)
     clouds: dict[str, Cloud] = {}
@@ -74,7 +75,7 @@ def registered(seed: int) -> Registration:
         J = centre_jacobian(T[:3, 3], inverse=True)
         priors[name] = Prior(T_world_cam=T, covariance=J @ at_centre @ J.T)
     pairs = overlapping_pairs(clouds, given, CONFIG)
-    return register(clouds, given, priors, pairs, CONFIG, floor=LEVEL, reference=NAMES[0])
+    return register(clouds, given, priors, pairs, CONFIG, floor=LEVEL, reference=NAMES[0], kept=kept, scales=scales)
 
 
 @pytest.fixture(scope="module")
@@ -147,3 +148,17 @@ def test_biases_are_as_wrong_as_promised_and_less_than_beforehand(trials: list[R
         for name in NAMES:
             sigma = np.sqrt(np.diag(found.bias_covariance[name])[:2])
             assert (sigma < 1.5 * np.array([PRIOR_SCALE, PRIOR_DISPARITY_PX / FOCAL_BASELINE])).all()
+
+
+def test_cameras_beside_one_that_was_kept_are_as_wrong_as_promised(trials: list[Registration]):
+    """A camera that stays where it is wrong takes the others along."""
+    told, free = [], []
+    for seed, found in enumerate(trials):
+        beside = registered(seed, kept=NAMES[2:], scales=found.scales)
+        e = log_se3(RIG[NAMES[1]] @ invert_transform(beside.T_world_cam[NAMES[1]]))
+        told.append(float(e @ np.linalg.solve(beside.covariance[NAMES[1]], e)) / 6)
+        free.append(float(e @ np.linalg.solve(found.covariance[NAMES[1]], e)) / 6)
+    # 48 degrees of freedom: 1 +- 0.2 if all is exact.
+    assert 0.5 < np.mean(told) < 1.5
+    # What is known of it where the other one is free to move, too.
+    assert np.mean(free) > 1.5 * np.mean(told)

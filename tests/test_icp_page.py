@@ -128,7 +128,8 @@ def test_biases_are_told_in_their_own_units() -> None:
 
 def test_pairs_of_many_cameras_are_listed_where_they_overlap_and_counted_where_not() -> None:
     meets = ICPResult(np.eye(4), 0.5, 0.01, np.eye(6), converged=True)
-    apart = ICPResult(np.eye(4), 0.0, np.nan, np.zeros((6, 6)), converged=False, overlap_m2=0.0, overlaps=False)
+    told = {"overlap_m2": 0.0, "verdict": "do not overlap: so much is shared", "overlaps": False}
+    apart = ICPResult(np.eye(4), 0.0, np.nan, np.zeros((6, 6)), False, **told)
     few = {("a", "b"): meets, ("a", "c"): apart, ("b", "c"): apart}
     (pairs,) = sheets_of(ICPMetrics(True, per_pair_results=few), "abc", {})
     assert [row[:2] for row in pairs.rows] == [("a", "b"), ("a", "c"), ("b", "c")]

@@ -12,6 +12,8 @@ import pytest
 from floor_rooms import BASELINE_M, FLOOR, WALLS, Wall, cameras, depth_image, zoomed
 from icp_rooms import LEVEL, box
 
+from aruco.depth_bias import DepthBias
+from aruco.depth_noise import bias_prior
 from aruco.floor_model import centre_jacobian
 from aruco.floor_plane import FloorPlane
 from aruco.icp_cloud import Cloud, cloud_of
@@ -23,6 +25,7 @@ from aruco.icp_rows import Layout, Rows
 from aruco.icp_smooth import smoothed
 from aruco.icp_solve import Prior, Registration, register
 from aruco.icp_types import ICPConfig
+from aruco.icp_view import LEAST_BIAS
 from aruco.pose_math import Array, Pose, adjoint, exp_se3, exp_so3, invert_transform, log_so3, make_pose, pose_distance
 
 RIG = cameras()
@@ -164,6 +167,20 @@ def test_a_camera_without_overlap_is_kept():
     np.testing.assert_array_equal(found.T_world_cam["cam3"], start["cam3"])
 
 
+def test_a_place_to_begin_at_of_a_camera_that_takes_no_part_is_none():
+    """Cameras that were found may be of another part of the rig, or have no cloud."""
+    start = off(GOOD, 1)
+    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, GOOD)) for name, T in start.items()}
+    pairs, config = overlapping_pairs(seen(), start, FULL), replace(FULL, max_iterations=[1, 1, 1])
+    found, plain = (
+        register(seen(), start, priors, pairs, config, floor=LEVEL, reference="cam0", begin=begin)
+        for begin in ({"elsewhere": start["cam1"]}, None)
+    )
+    assert found.T_world_cam.keys() == start.keys()
+    for name, T in plain.T_world_cam.items():
+        np.testing.assert_array_equal(found.T_world_cam[name], T)
+
+
 def test_without_floor_or_pairs_poses_stay():
     start = off(ROUGH, 1)
     priors = {name: Prior(T_world_cam=T) for name, T in start.items()}
@@ -236,9 +253,26 @@ def test_depth_errors_are_estimated_with_the_poses():
     # They are told from none.
     assert found.bias["cam1"][1] > 2.0 * np.sqrt(found.bias_covariance["cam1"][1, 1])
     assert mean_mm(found.T_world_cam) < mean_mm(start)
-    plain = registered(seen(STEPS, px), start, GOOD, config=replace(FULL, depth_bias=False))
-    assert not any(b.any() for b in plain.bias.values())
+    believed = {n: replace(c, bias_covariance=1e-8 * c.bias_covariance) for n, c in seen(STEPS, px).items()}
+    plain = registered(believed, start, GOOD)
+    # They are allowed for where they are not asked for, too.
+    silent = registered(seen(STEPS, px), start, GOOD, config=replace(FULL, depth_bias=False))
+    np.testing.assert_array_equal(silent.T_world_cam["cam2"], found.T_world_cam["cam2"])
     assert mean_mm(plain.T_world_cam) > mean_mm(found.T_world_cam)
+
+
+@pytest.mark.parametrize("known", [np.zeros((2, 2)), np.array([[1e-6, 1e-8], [1e-8, 1e-10]])])
+def test_a_depth_error_that_is_known_for_certain_may_be_registered_with(known: Array):
+    """Files may say so: sigmas of zero, or a correlation of one."""
+    start, bias = off(GOOD, 2), DepthBias(covariance=known, focal_baseline=84.0)
+    sure = cloud_of("cam1", {**data_of("cam1", STEPS), "bias": bias}, FULL, T_world_cam=RIG["cam1"], floor=LEVEL)
+    found = registered({**seen(), "cam1": sure}, start, GOOD)
+    assert mean_mm(found.T_world_cam) < mean_mm(start)
+    # Known to a part of what is usual still: no farther from what was said than that.
+    along = np.linalg.inv(known + LEAST_BIAS**2 * bias_prior(84.0))
+    assert found.bias["cam1"][:2] @ along @ found.bias["cam1"][:2] < 9.0
+    for S in (found.covariance["cam1"], found.bias_covariance["cam1"]):
+        assert np.linalg.eigvalsh(S).min() > 0
 
 
 def test_evidence_tells_rigs_with_depth_errors_from_those_without():
@@ -351,7 +385,8 @@ def two() -> Two:
     return clouds, surfaces, Layout(("cam0", "cam1")), (there, back)
 
 
-def test_gaps_follow_every_unknown_as_their_derivatives_say(two: Two):
+@pytest.mark.parametrize("both_normals", [False, True])
+def test_gaps_follow_every_unknown_as_their_derivatives_say(two: Two, both_normals: bool):
     clouds, _, layout, (there, back) = two
     # Levers are taken on the surface; here everything is, so that differences of gaps are the derivative itself.
     surfaces = {name: cloud.depth_m for name, cloud in clouds.items()}
@@ -362,7 +397,7 @@ def test_gaps_follow_every_unknown_as_their_derivatives_say(two: Two):
             name: replace(cloud, depth_m=cloud.depth_m + state.bias[name] @ cloud.slopes)
             for name, cloud in clouds.items()
         }
-        pair = pair_rows(state, now, surfaces, layout, there, back, both_normals=False)
+        pair = pair_rows(state, now, surfaces, layout, there, back, both_normals=both_normals)
         floors = [floor_rows(state, now, surfaces, layout, name) for name in layout.cameras]
         return joined([pair, *floors], clouds, layout)[0]
 
@@ -376,7 +411,12 @@ def test_gaps_follow_every_unknown_as_their_derivatives_say(two: Two):
         # Second order, 1e-6 times metres; slopes of the floor turn its normal by their square only. Depth errors of
         # both cameras are told where the source's sample lies, up to a few cm beside the target's.
         is_error = any(layout.bias(name).start <= k < layout.bias(name).stop for name in layout.cameras)
-        np.testing.assert_allclose(measured, told, atol=0.02 * np.abs(told).max() if is_error else 2e-5)
+        exact = 2e-5
+        if both_normals:
+            # Normals that are not the same turn otherwise than their mean: tenths of a radian of millimetres, where a
+            # lever to one of both samples is wrong by half a correspondence, 0.07.
+            exact = 1e-3
+        np.testing.assert_allclose(measured, told, atol=0.02 * np.abs(told).max() if is_error else exact)
 
 
 def test_what_both_directions_see_counts_once(two: Two):

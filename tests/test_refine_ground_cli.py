@@ -545,7 +545,7 @@ def test_one_camera_that_measured_nothing_does_not_stop_the_others(
 ) -> None:
     result = level(rig, spoilt(store, tmp_path, ["cam1"], EMPTY_DEPTH[name]), tmp_path / "level.json")
     assert result.exit_code == 3, result.output
-    assert "WARNING depth of cameras cam1 holds no measurement" in result.output
+    assert "WARNING depth of camera cam1 holds no measurement" in result.output
     note = json.loads((tmp_path / "level.json").read_text())["_meta"]["ground_refined"]
     assert list(note["without_correction"]) == ["cam1"]
 

@@ -15,7 +15,7 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from floor_rooms import FOCAL_BASELINE, depth_of
+from floor_rooms import FOCAL_BASELINE, depth_of, nudged
 from level_runs import TRUE, TURN, change, document, failed, given_poses, level, registered, store_of
 
 from aruco import icp_registration
@@ -260,6 +260,22 @@ def test_it_starts_from_levelled_poses_and_believes_the_markers_once(
             assert np.allclose(call["covariances"][name], wanted, rtol=1e-9, atol=1e-15)
 
 
+def test_what_was_known_of_a_camera_that_the_floor_contradicts_is_forgotten(
+    rig: Path, store: Path, tmp_path: Path, fake: Fake
+) -> None:
+    # 0.03 degrees and 2 mm, but for one that was bumped by 3 degrees.
+    good = nudged(TRUE, degrees=0.03, mm=2.0, seed=4)
+    aslant = make_pose(exp_so3(np.radians([0.0, 0.0, 3.0])) @ good[KEPT][:3, :3], good[KEPT][:3, 3])
+    covariance = np.diag([0.0005**2] * 3 + [0.002**2] * 3)
+    write_json(rig, document(given_poses({**good, KEPT: aslant}), covariance))
+    content, said = registered(rig, store, tmp_path / "out.json", code=3)
+    assert list(content["_meta"]["ground_refined"]["contradicted"]["cameras"]) == [KEPT]
+    assert fake.calls[0]["covariances"].keys() == TRUE.keys() - {KEPT}
+    (remark,) = content["_meta"]["icp_refined"]["remarks"]
+    assert remark.startswith(f"The floor contradicts the given pose of {KEPT} by far more")
+    assert remark in said
+
+
 def test_of_a_camera_that_nobody_says_anything_of_nothing_is_said(rig: Path, tmp_path: Path, fake: Fake) -> None:
     change(rig, lambda content: content["_meta"].pop("covariance"))
     three = store_of(tmp_path / "three.h5", {n: d for n, d in depth_of(TRUE).items() if n != "cam3"})
@@ -326,6 +342,20 @@ def test_what_moving_makes_untrue_goes(rig: Path, store: Path, tmp_path: Path, f
     assert np.allclose(np.array(content["_meta"]["covariance"][MOVED]).reshape(6, 6), 1e-6 * np.eye(6))
 
 
+def test_figures_of_markers_stand_under_the_step_that_moved_the_camera_first(
+    rig: Path, store: Path, tmp_path: Path, fake: Fake
+) -> None:
+    change(rig, lambda content: [content[name].update(rms_px=0.1) for name in TRUE])
+    content, _ = registered(rig, store, tmp_path / "both.json")
+    assert all(content[name]["before_levelling"] == {"rms_px": 0.1} for name in TRUE)
+    # Bounds that no correction by the floor keeps.
+    content, _ = registered(rig, store, tmp_path / "clouds.json", "--max-rotation-deg", 1e-6, code=3)
+    assert content[MOVED]["before_icp"] == {"rms_px": 0.1}
+    assert not content[MOVED].keys() & {"rms_px", "before_levelling"}
+    assert content[KEPT]["rms_px"] == 0.1
+    assert not content[KEPT].keys() & {"before_icp", "before_levelling"}
+
+
 def test_where_nothing_moved_the_levelled_covariances_stay(rig: Path, store: Path, tmp_path: Path, fake: Fake) -> None:
     kept = {n: dataclasses.replace(move, accepted=False) for n, move in fake.metrics.cameras.items()}
     fake.metrics = some_metrics(cameras=kept, message="every camera keeps its pose: no gap shrank")
@@ -378,6 +408,21 @@ def test_a_bias_goes_only_with_the_pose_that_it_was_estimated_with(
     fake.metrics = dataclasses.replace(fake.metrics, cameras=kept)
     content, _ = registered(rig, store, tmp_path / "out.json")
     assert content["_meta"]["depth_bias"] == {KEPT: old}
+
+
+def test_the_reference_of_a_part_in_which_nobody_moved_keeps_its_bias(
+    rig: Path, store: Path, tmp_path: Path, fake: Fake
+) -> None:
+    moves, pair = fake.metrics.cameras, fake.metrics.per_pair_results[REFERENCE, MOVED]
+    of_part = CameraMove(accepted=False, reason="it is the reference of its part", refusal="reference")
+    apart = dataclasses.replace(pair, converged=False, overlaps=False)
+    fake.metrics = some_metrics(
+        cameras={**moves, KEPT: of_part, "cam3": moves[KEPT]},
+        per_pair_results={(REFERENCE, MOVED): pair, (KEPT, "cam3"): pair, (REFERENCE, KEPT): apart},
+        biases=dict.fromkeys(TRUE, NEW_BIAS),
+    )
+    content, _ = registered(rig, store, tmp_path / "out.json")
+    assert content["_meta"]["depth_bias"].keys() == {REFERENCE, MOVED}
 
 
 def test_covariances_of_cameras_that_stay_stay(rig: Path, store: Path, tmp_path: Path, fake: Fake) -> None:

@@ -203,7 +203,7 @@ def test_biases_that_are_known_are_taken_out_and_told(slid: Path, small: Path, t
         assert bias["before"]["sigma_scale"] == pytest.approx(1e-4)
         # What is known that well clouds of small images cannot correct.
         assert abs(bias["after"]["scale"]) < 3e-4
-        assert bias["after"]["sigma_scale"] <= 1.001e-4
+        assert bias["after"]["sigma_scale"] <= 1.02e-4  # no more than was given, but for the least that is always left
 
 
 def test_cameras_of_which_no_baseline_is_known_are_registered(slid: Path, tmp_path: Path) -> None:

@@ -29,13 +29,15 @@ _OF_CAMERAS = (
 )
 _PAIRS = "Pairs of clouds: how one moved against the other"
 _OF_PAIRS = (
-    "Overlap: seen from above. Fitness: of the points that could meet, the share that do; RMSE: of their distances; "
+    "Overlap: of the clouds' boxes seen from above, with a margin around. Samples: of the first cloud, every second "
+    "one is looked up. Fitness: of what could meet of both clouds, the share that does; RMSE: of the distances; "
     "neither proves a move. Clouds do not tell: of what this pair by itself says less than the given poses."
 )
 _BIASES = "Depth bias, estimated together with the poses"
 _OF_BIASES = (
-    "What measured depth is off by: in proportion, and in disparity (px; stereo cameras) or by an offset (mm). In "
-    "file: whether it goes with the poses that are written, under _meta.depth_bias."
+    "What measured depth is off by: in proportion, and in disparity (px; stereo cameras), by an offset (mm), or in "
+    "inverse depth (/km, where no baseline is told: 1 /km is 1 mm at 1 m, 16 mm at 4 m). In file: whether it goes with "
+    "the poses that are written, under _meta.depth_bias."
 )
 # All pairs of six cameras; of more, only those that overlap are listed.
 MOST_PAIRS = 15
@@ -158,7 +160,7 @@ def _pair_sheet(results: Mapping[tuple[str, str], ICPResult]) -> Sheet:
             "cloud",
             "against",
             "overlap\nm2",
-            "points\nthat met",
+            "samples\nthat met",
             "fitness",
             "RMSE\nmm",
             "turn\ndegrees",
@@ -173,7 +175,7 @@ def _pair_sheet(results: Mapping[tuple[str, str], ICPResult]) -> Sheet:
 
 def _pair_cells(result: ICPResult) -> tuple[str, ...]:
     if not result.overlaps:
-        return told(result.overlap_m2, ".2f"), *["-"] * 5, untold(result.unobservable), "do not overlap"
+        return told(result.overlap_m2, ".2f"), *["-"] * 5, untold(result.unobservable), result.verdict.split(":")[0]
     return (
         told(result.overlap_m2, ".2f"),
         str(result.n_points),
