@@ -71,7 +71,7 @@ def _counted(refusals: Iterable[Refusal]) -> str:
 
 def warnings_of(metrics: ICPMetrics, rig: RigParts, config: ICPConfig) -> tuple[str, ...]:
     """What wants to be done about the rig."""
-    elsewhere = {n: m for n, m in sorted(metrics.cameras.items()) if _is_elsewhere(m, config)}
+    elsewhere = {n: m for n, m in sorted(metrics.cameras.items()) if is_elsewhere(m, config)}
     told = [_bumped(elsewhere, metrics.reference_camera, config)] if elsewhere else []
     if metrics.num_pairs_attempted and not metrics.num_pairs_converged:
         told.append(_none_meets(config))
@@ -88,7 +88,7 @@ def _none_meets(config: ICPConfig) -> str:
     )
 
 
-def _is_elsewhere(move: CameraMove, config: ICPConfig) -> bool:
+def is_elsewhere(move: CameraMove, config: ICPConfig) -> bool:
     """Whether a camera's cloud asks for a place that the given pose forbids."""
     if move.refusal in ("prior", "too_far"):
         return True

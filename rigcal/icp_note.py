@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from aruco.depth_bias import DepthBias
+from aruco.icp_headline import is_elsewhere
 from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics, ICPResult, Pair
 from aruco.pose_math import Array, Pose, invert_transform, pose_text
 from rigcal import __version__
@@ -73,11 +74,25 @@ def registered_content(
 ) -> dict[str, Any]:
     """The content of a levelled file with what its clouds have told beyond poses and covariances."""
     meta = {**content["_meta"], "icp_refined": dict(note)}
+    if isinstance(meta.get("quality"), dict):
+        meta["quality"] = _judged(meta["quality"], registration)
     known = meta.get("depth_bias")
     new = {name: bias.as_dict() for name, bias in registration.new_bias.items()}
     if new:
         meta["depth_bias"] = {**(known if isinstance(known, dict) else {}), **new}
     return {**content, "_meta": meta}
+
+
+def _judged(quality: Mapping[str, Any], registration: Registration) -> dict[str, Any]:
+    """``_meta.quality``, which cannot be good while clouds place a camera elsewhere than its pose."""
+    metrics = registration.metrics
+    elsewhere = [name for name, move in metrics.cameras.items() if is_elsewhere(move, registration.config)]
+    if not (metrics.success and elsewhere):
+        return dict(quality)
+    told = quality.get("reasons", [])
+    reason = f"The cloud of {', '.join(elsewhere)} contradicts the given pose; see icp_refined.warnings."
+    before = {"verdict_before_icp": quality["verdict"]} if "verdict" in quality else {}
+    return {**quality, **before, "verdict": "bad", "reasons": [reason, *(told if isinstance(told, list) else [])]}
 
 
 def icp_note(given: RigFile, source: DepthFile, registration: Registration) -> dict[str, Any]:

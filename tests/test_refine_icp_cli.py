@@ -298,6 +298,21 @@ def test_up_and_bias_are_those_of_the_file(store: Path, tmp_path: Path, fake: Fa
 # -- what the file says
 
 
+@pytest.mark.parametrize(("refusal", "verdict"), [("prior", "bad"), ("unproved", "good")])
+def test_a_camera_that_clouds_place_elsewhere_makes_the_verdict_bad(
+    refusal: str, verdict: str, rig: Path, store: Path, tmp_path: Path, fake: Fake
+) -> None:
+    change(rig, lambda content: content["_meta"].update(quality={"verdict": "good", "reasons": ["All is well."]}))
+    moves = {**fake.metrics.cameras}
+    moves[KEPT] = dataclasses.replace(moves[KEPT], refusal=refusal)
+    fake.metrics = some_metrics(cameras=moves)
+    content, _ = registered(rig, store, tmp_path / "out.json")
+    quality = content["_meta"]["quality"]
+    assert quality["verdict"] == verdict
+    assert (f"The cloud of {KEPT}" in quality["reasons"][0]) == (verdict == "bad")
+    assert quality.get("verdict_before_icp") == ("good" if verdict == "bad" else None)
+
+
 def test_only_what_was_accepted_is_moved(rig: Path, store: Path, tmp_path: Path, fake: Fake) -> None:
     level(rig, store, tmp_path / "level.json")
     content, said = registered(rig, store, tmp_path / "out.json")
