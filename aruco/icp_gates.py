@@ -4,7 +4,10 @@ Owns      the rounds of refusing, setting clouds aside and registering again; wh
 Leaves    held-out distances to icp_heldout, what else speaks against a move to icp_objections.
 
 A camera to whose move something speaks against has no say any more: its cloud is set aside, for it would pull the
-others to where it was not allowed to go. One whose move is merely not proved keeps its pose and remains a witness.
+others to where it was not allowed to go. One whose move is merely not proved keeps its pose, but the others are moved
+as the estimate has them in which it is free: held where it was it would pull them to its own error. As errors of an
+estimate are uncorrelated with what it has taken away, a moved camera is then expected to stand no worse beside one
+that was not than before.
 """
 
 from __future__ import annotations
@@ -75,7 +78,7 @@ def judge(
     register: Register,
     alone: Collection[str] = (),
 ) -> Verdict:
-    """Keep the moves that hold, refuse the others and register again, until nothing is left to refuse.
+    """Register again without clouds that something speaks against, and keep those of the moves left that are proved.
 
     Args:
         registration: With all cameras free but the reference.
@@ -97,20 +100,19 @@ def judge(
         moving = [n for n in registration.layout.cameras if n != registration.reference and n not in registration.kept]
         trial = _Trial(case=case, held=held_out(registration, seed=config.seed), alone=frozenset(alone))
         objection = worst_objection(case, registration, moving)
-        if objection is not None:
-            refused = {objection.camera: trial.objected(objection, moving)}
-            left_out.append(objection.camera)
-        else:
-            refused = trial.unproved(moving)
-        if not refused:
+        if objection is None:
             break
-        for name, move in refused.items():
-            logger.debug("round {}: {}: {}", rounds, name, move.reason)
-        moves.update(refused)
+        moves[objection.camera] = trial.objected(objection, moving)
+        logger.debug("round {}: {}: {}", rounds, objection.camera, objection.reason)
+        left_out.append(objection.camera)
         registration = register(tuple(sorted(moves)), tuple(left_out))
     else:
         raise AssertionError("a round refused nothing and went on")
-    moves.update({name: trial.accepted(name, moving) for name in moving})
+    moves.update(trial.unproved(moving))
+    believed = [name for name in moving if name not in moves]
+    moves.update({name: trial.accepted(name, believed) for name in believed})
+    stay = {name: start[name] for name in registration.layout.cameras if name not in believed}
+    registration = replace(registration, T_world_cam={**registration.T_world_cam, **stay})
     if registration.reference not in moves:
         moves[registration.reference] = CameraMove(accepted=False, reason=words.is_reference())
     return Verdict(registration=registration, moves=dict(sorted(moves.items())), left_out=tuple(left_out))
@@ -129,7 +131,7 @@ class _Trial:
         refused: dict[str, CameraMove] = {}
         asked = left = list(moving)
         # A refusal tells most on cameras that overlap it: first these are asked again, at the end all that are left.
-        while (failing := self._failing(asked, left, tuple(refused))) or len(asked) < len(left):
+        while (failing := self._failing(asked, left)) or len(asked) < len(left):
             # The least proved; of many that fail half at once.
             worst = sorted(failing, key=lambda name: failing[name].gain_sigmas)[: max(1, len(failing) // 2)]
             refused |= {name: failing[name] for name in worst}
@@ -138,19 +140,19 @@ class _Trial:
             asked = [name for name in left if not failing or name in failing or name in near]
         return refused
 
-    def _failing(self, asked: Sequence[str], left: Sequence[str], away: tuple[str, ...]) -> dict[str, CameraMove]:
-        """Cameras whose move is not proved, of those asked about, where some are left and those away kept already."""
+    def _failing(self, asked: Sequence[str], left: Sequence[str]) -> dict[str, CameraMove]:
+        """Cameras whose move is not proved, of those asked about, by itself and with those left that overlap it."""
         failing: dict[str, CameraMove] = {}
         for name in asked:
-            own = self.held.compared((*away, name), away)
+            own = self.held.compared((name,), ())
             together = self._beside(name, left)
-            joint = self.held.compared((*away, *together), away).sigmas
+            joint = self.held.compared(together, ()).sigmas
             if own.gain < -MAX_GROWTH and own.sigmas < -MAX_GROWTH_SIGMAS:
                 reason = words.speaks_against(*self._size(name), -own.sigmas)
-                failing[name] = self.move(name, (name,), reason, "worse", away=away)
+                failing[name] = self.move(name, (name,), reason, "worse")
             elif joint < JOINT_SIGMAS:
                 reason = words.not_proved(*self._size(name), joint, len(together) - 1, JOINT_SIGMAS)
-                failing[name] = self.move(name, together, reason, "unproved", away=away)
+                failing[name] = self.move(name, together, reason, "unproved")
         return failing
 
     def _beside(self, camera: str, moving: Sequence[str]) -> list[str]:
@@ -176,9 +178,7 @@ class _Trial:
         reason = words.gained(*self._size(camera), gaps, move.gain_sigmas, len(together) - 1, move.prior_sigmas)
         return replace(move, accepted=True, reason=reason)
 
-    def move(
-        self, camera: str, together: Sequence[str], reason: str, refusal: Refusal, *, away: Sequence[str] = ()
-    ) -> CameraMove:
+    def move(self, camera: str, together: Sequence[str], reason: str, refusal: Refusal) -> CameraMove:
         """What is told of a refused move.
 
         Args:
@@ -186,7 +186,6 @@ class _Trial:
             together: Cameras, this among them, with and without whose moves distances are compared.
             reason: Why it is refused.
             refusal: The kind of that.
-            away: Cameras that are kept either way.
         """
         reg = self.held.registration
         turn_deg, shift_m = self._size(camera)
@@ -196,9 +195,9 @@ class _Trial:
             refusal=refusal,
             rotation_deg=turn_deg,
             translation_mm=1e3 * shift_m,
-            held_out_before_mm=self.held.median_mm(camera, away, together),
-            held_out_after_mm=self.held.median_mm(camera, away),
-            gain_sigmas=self.held.compared((*away, *together), away).sigmas,
+            held_out_before_mm=self.held.median_mm(camera, together),
+            held_out_after_mm=self.held.median_mm(camera),
+            gain_sigmas=self.held.compared(together, ()).sigmas,
             prior_sigmas=prior_sigmas(self.case, reg, camera),
             unobservable=reg.unobservable.get(camera, ()),
         )

@@ -197,7 +197,7 @@ class Doubtful:
         sigmas = -3.0 if {*before} - {*after} == {"cam2"} else 5.0
         return Comparison(gain=sigmas, share=0.5 + sigmas, sigma=1.0)
 
-    def median_mm(self, camera: str, kept: Collection[str], more: Collection[str] = ()) -> float:
+    def median_mm(self, camera: str, kept: Collection[str] = (), more: Collection[str] = ()) -> float:
         return float(len({*kept, *more}))
 
 
@@ -472,24 +472,24 @@ def test_predictions_with_cameras_kept_are_those_of_equations_in_which_they_are_
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Row:
-    """What was held out of cameras in a row, of which some fail once others are kept."""
+    """What was held out of cameras in a row, of which some groups fail."""
 
     registration: Registration
-    after: Mapping[str, str]  # who fails -> once who is kept, or "": at once
+    failing: Collection[tuple[str, ...]]  # whose moves together are not proved
     asked: list[tuple[str, ...]]
 
     def compared(self, before: Collection[str], after: Collection[str]) -> Comparison:
-        self.asked.append(tuple(sorted(after)))
-        alone = {*before} - {*after}
-        fails = len(alone) == 1 and self.after.get(min(alone), "-") in ("", *after)
-        return Comparison(gain=-9.0 if fails else 9.0, share=-9.0 if fails else 9.0, sigma=1.0)
+        assert not after  # nobody is held where it was meanwhile
+        self.asked.append(tuple(sorted(before)))
+        gain = -9.0 if self.asked[-1] in self.failing else 9.0
+        return Comparison(gain=gain, share=gain, sigma=1.0)
 
-    def median_mm(self, camera: str, kept: Collection[str], more: Collection[str] = ()) -> float:
+    def median_mm(self, camera: str, kept: Collection[str] = (), more: Collection[str] = ()) -> float:
         return 1.0
 
 
-def refused(after: Mapping[str, str], n: int = 20) -> tuple[set[str], list[tuple[str, ...]]]:
-    """Cameras of a row that are refused, and with whom kept already each was asked about."""
+def refused(failing: Collection[tuple[str, ...]], n: int = 20) -> tuple[set[str], list[tuple[str, ...]]]:
+    """Cameras of a row that are refused, and about whose moves together was asked."""
     names = [f"c{k:02d}" for k in range(n)]
     registration: Any = SimpleNamespace(
         pairs=dict.fromkeys(pairwise(names)),
@@ -499,22 +499,22 @@ def refused(after: Mapping[str, str], n: int = 20) -> tuple[set[str], list[tuple
     )
     priors = {name: Prior(T_world_cam=np.eye(4)) for name in names}
     case = Case(clouds={}, start=registration.T_world_cam, priors=priors, config=FULL, floor=None)
-    held: Any = Row(registration=registration, after=after, asked=[])
+    held: Any = Row(registration=registration, failing=failing, asked=[])
     trial = icp_gates._Trial(case=case, held=held, alone=frozenset())
     return {*trial.unproved(names[1:])}, held.asked
 
 
 def test_a_refusal_is_no_reason_to_ask_about_cameras_far_away_until_all_are_asked_at_the_end():
-    chain = {"c05": "", "c06": "c05", "c07": "c06", "c08": "c07"}
-    gone, asked = refused(chain)
-    assert gone == {*chain}
+    # One fails by itself; each next one once the one before it is gone.
+    gone, asked = refused([("c05",), ("c06", "c07"), ("c07", "c08"), ("c08", "c09")])
+    assert gone == {"c05", "c06", "c07", "c08"}
     # Twice about each camera, at the start and at the end, and about few between; two comparisons each, and a third
     # for what is told of each refusal.
     assert len(asked) < 2 * (2 * 19 + 3 * 4)
-    # Nobody passes without having been asked against all that are kept in the end.
-    gone, asked = refused({"c05": "", "c15": "c05"})
-    assert gone == {"c05", "c15"}
-    assert sum(after == ("c05", "c15") for after in asked) >= 2 * 17
+    # Nobody passes without having been asked beside all that are left in the end.
+    gone, asked = refused([("c05",)])
+    assert gone == {"c05"}
+    assert sum(len(names) == 1 for names in asked) >= 2 * 18
 
 
 def test_clouds_set_aside_have_no_say():
