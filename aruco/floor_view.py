@@ -119,12 +119,7 @@ def floor_samples(camera: str, data: Mapping[str, Any], stride: int) -> FloorSam
         InputError: They are no depth image with intrinsics of its own.
     """
     where = f"camera {camera}"
-    if "depth" not in data or "K" not in data:
-        raise InputError(
-            f"{where}: want its depth and the K of that depth, got {', '.join(sorted(data)) or 'nothing'}."
-        )
-    depth = check_depth(data["depth"], where)
-    K = checked_intrinsics(data["K"], depth.shape, where)
+    depth, K = depth_and_intrinsics(data, where)
     _check_stride(stride, depth.shape, where)
     baseline = data.get("baseline")
     bias = data.get("bias") or DepthBias()
@@ -150,7 +145,17 @@ def floor_samples(camera: str, data: Mapping[str, Any], stride: int) -> FloorSam
     )
 
 
-def checked_intrinsics(K: Any, shape: tuple[int, ...], where: str) -> Array:
+def depth_and_intrinsics(data: Mapping[str, Any], where: str) -> tuple[Array, Array]:
+    """Depth (h, w) [m] and its camera matrix (3, 3) from one camera's data; InputError where they are none."""
+    if "depth" not in data or "K" not in data:
+        raise InputError(
+            f"{where}: want its depth and the K of that depth, got {', '.join(sorted(data)) or 'nothing'}."
+        )
+    depth = check_depth(data["depth"], where)
+    return depth, _checked_intrinsics(data["K"], depth.shape, where)
+
+
+def _checked_intrinsics(K: Any, shape: tuple[int, ...], where: str) -> Array:
     """The camera matrix (3, 3) of a depth image of this shape; InputError where it is none or of another size."""
     matrix = np.array(K, dtype=np.float64)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:

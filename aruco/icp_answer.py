@@ -162,7 +162,7 @@ def answered(given: Given, parts: Sequence[Part], left_out: Mapping[str, str], m
     biases: dict[str, DepthBias] = {}
     for part in parts:
         poses |= part.result.T_world_cam
-        covariances |= part.result.covariance | _known_before(given, part)
+        covariances |= part.result.covariance
         if given.config.depth_bias:
             heard = {name for pair in part.result.pairs for name in pair} - {*part.verdict.left_out}
             biases |= {name: _bias(given.clouds[name], part.result, name) for name in sorted(heard)}
@@ -193,16 +193,6 @@ def answered(given: Given, parts: Sequence[Part], left_out: Mapping[str, str], m
     rig = RigParts(parts=[part.cameras for part in parts], alone=alone)
     told = {"warnings": warnings_of(answer, rig, given.config), "remarks": remarks_of(answer)}
     return poses, replace(answer, message=message_of(answer, given.begin.keys()), **told)
-
-
-def _known_before(given: Given, part: Part) -> dict[str, Array]:
-    """(6, 6) of cameras that were free in the estimate and yet keep their poses, as these were known."""
-    before: dict[str, Array] = {}
-    for name in {*part.cameras} - {part.result.reference, *part.result.kept}:
-        S = given.start_covariances.get(name, given.priors[name].covariance)
-        if S is not None and not part.verdict.moves[name].accepted:
-            before[name] = S
-    return before
 
 
 def _cameras(

@@ -13,7 +13,7 @@ Bayesian Learning for Neural Networks, 1996): what floors say of tilt and height
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 
 import numpy as np
@@ -34,9 +34,7 @@ _OWN = np.geomspace(0.2, 20.0, 17)
 _DEPTH = {"bias": np.geomspace(0.1, 2.0, 13), "lean": np.geomspace(0.1, 2.0, 9)}
 
 
-def told_scales(
-    known: Known, state: State, clouds: Normal, M: Array, current: Scales, *, kept: Collection[str] = ()
-) -> Scales:
+def told_scales(known: Known, state: State, clouds: Normal, M: Array, current: Scales) -> Scales:
     """The factors that clouds tell.
 
     Args:
@@ -45,11 +43,9 @@ def told_scales(
         clouds: What clouds say there.
         M: (size, k) the unknowns by the free ones.
         current: Factors that are taken to hold while others are told.
-        kept: Cameras that are not free to move. Of how well poses are known they say nothing; where nobody has said it
-            of theirs, it is as of the others in the middle.
     """
-    parts = known.parts(state, kept)
-    unknown = [c for c in known.layout.cameras if not known.given(c) and c not in kept]
+    parts = known.parts(state)
+    unknown = [c for c in known.layout.cameras if not known.given(c)]
     now = {
         **{default_of(aspect, c): 1.0 for aspect in ASPECTS for c in unknown} | dict(current.default),
         **{"given": current.given, "bias": current.bias, "lean": current.lean, "certain": 1.0},
@@ -60,7 +56,6 @@ def told_scales(
     for aspect in ASPECTS if unknown else ():
         names = [default_of(aspect, c) for c in unknown]
         now.update(_told_defaults(clouds, parts, M, now, names))
-        told |= dict.fromkeys((default_of(aspect, c) for c in kept if not known.given(c)), _middle(now, names))
         told |= {name: now[name] for name in names}
     if "given" in parts:
         now.update(_told(clouds, parts, M, now, {"given": _POSES}))

@@ -4,10 +4,8 @@ Owns      the rounds of refusing, setting clouds aside and registering again; wh
 Leaves    held-out distances to icp_heldout, what else speaks against a move to icp_objections.
 
 A camera to whose move something speaks against has no say any more: its cloud is set aside, for it would pull the
-others to where it was not allowed to go. One whose move is merely not proved keeps its pose, but the others are moved
-as the estimate has them in which it is free: held where it was it would pull them to its own error. As errors of an
-estimate are uncorrelated with what it has taken away, a moved camera is then expected to stand no worse beside one
-that was not than before.
+others to where it was not allowed to go. One whose move is merely not proved keeps its pose, and stays free in the
+estimate: held where it was it would pull the others to its own error. See icp_placing for where these then go.
 """
 
 from __future__ import annotations
@@ -25,19 +23,19 @@ from aruco.floor_plane import FloorPlane
 from aruco.icp_cloud import Cloud
 from aruco.icp_heldout import HeldOut, held_out
 from aruco.icp_objections import Case, Objection, prior_sigmas, worst_objection
+from aruco.icp_placing import placed
 from aruco.icp_prior import Prior
 from aruco.icp_solve import Pair, Registration
 from aruco.icp_types import CameraMove, ICPConfig, Refusal
 from aruco.pose_math import Pose, pose_distance
 
-# A move of a millimetre or two, which is what clouds can add to a good pose, is hardly ever proved by itself, and
-# cameras that stay where they were wrong hold the others back. So the moves of a camera and of those that overlap it
-# are proved together, which chance does in 2 of a hundred cases in which half of them would be as good.
+# A move of a millimetre or two, which is what clouds can add to a good pose, is hardly ever proved by itself, and it is
+# only right beside the moves of the others. So those of a camera and of all that overlap it are proved together, which
+# chance does in 2 of a hundred cases in which half of them would be as good.
 JOINT_SIGMAS = 2.0
 # Its own move must not be spoken against: squared distances, in their variances, must not grow by more than the one,
 # which is as little as one more stray cell, unless that is less than the other of their standard errors. What is asked
-# for proof is asked for this too: at one standard error chance would refuse right moves now and then, and a camera that
-# stays where it was wrong holds the others back.
+# for proof is asked for this too: at one standard error chance would refuse right moves now and then.
 MAX_GROWTH = 2.0
 MAX_GROWTH_SIGMAS = 2.0
 
@@ -45,8 +43,8 @@ MAX_GROWTH_SIGMAS = 2.0
 class Register(Protocol):
     """The same registration once more."""
 
-    def __call__(self, kept: Collection[str], silent: Collection[str] = ()) -> Registration:
-        """With some cameras where they were, and the clouds of some of these set aside (see ``set_aside``)."""
+    def __call__(self, silent: Collection[str]) -> Registration:
+        """With the clouds of some cameras set aside (see ``set_aside``)."""
         ...
 
 
@@ -54,7 +52,7 @@ class Register(Protocol):
 class Verdict:
     """What is left of a registration."""
 
-    registration: Registration  # in which only cameras move whose move is kept
+    registration: Registration  # in which only cameras move whose moves are kept
     moves: dict[str, CameraMove]  # of all cameras
     left_out: tuple[str, ...]  # cameras whose clouds were set aside
 
@@ -95,9 +93,10 @@ def judge(
     left_out: list[str] = []
     # Each round refuses at least one camera; the reference's cloud may be set aside too.
     for rounds in range(1, len(start) + 2):
-        for name in sorted({*registration.kept} - moves.keys()):
+        for name in sorted({*registration.unlinked} - moves.keys()):
             moves[name] = CameraMove(accepted=False, reason=words.meets_nothing(tuple(left_out)), refusal="unlinked")
-        moving = [n for n in registration.layout.cameras if n != registration.reference and n not in registration.kept]
+        still = {registration.reference, *registration.unlinked}
+        moving = [name for name in registration.layout.cameras if name not in still]
         trial = _Trial(case=case, held=held_out(registration, seed=config.seed), alone=frozenset(alone))
         objection = worst_objection(case, registration, moving)
         if objection is None:
@@ -105,14 +104,13 @@ def judge(
         moves[objection.camera] = trial.objected(objection, moving)
         logger.debug("round {}: {}: {}", rounds, objection.camera, objection.reason)
         left_out.append(objection.camera)
-        registration = register(tuple(sorted(moves)), tuple(left_out))
+        registration = register(tuple(left_out))
     else:
         raise AssertionError("a round refused nothing and went on")
     moves.update(trial.unproved(moving))
     believed = [name for name in moving if name not in moves]
-    moves.update({name: trial.accepted(name, believed) for name in believed})
-    stay = {name: start[name] for name in registration.layout.cameras if name not in believed}
-    registration = replace(registration, T_world_cam={**registration.T_world_cam, **stay})
+    registration = placed(registration, [name for name in moving if name not in believed])
+    moves.update({name: trial.accepted(name, believed, registration.T_world_cam[name]) for name in believed})
     if registration.reference not in moves:
         moves[registration.reference] = CameraMove(accepted=False, reason=words.is_reference())
     return Verdict(registration=registration, moves=dict(sorted(moves.items())), left_out=tuple(left_out))
@@ -132,8 +130,11 @@ class _Trial:
         asked = left = list(moving)
         # A refusal tells most on cameras that overlap it: first these are asked again, at the end all that are left.
         while (failing := self._failing(asked, left)) or len(asked) < len(left):
-            # The least proved; of many that fail half at once.
-            worst = sorted(failing, key=lambda name: failing[name].gain_sigmas)[: max(1, len(failing) // 2)]
+            # Those that are spoken against may be why the others are not proved: half of them at once, the worst.
+            worse = sorted((n for n in failing if failing[n].refusal == "worse"), key=lambda n: failing[n].gain_sigmas)
+            # Moves that were not proved together are not asked about once more in ever smaller groups, until chance
+            # proves one of them.
+            worst = worse[: max(1, len(worse) // 2)] or sorted(failing)
             refused |= {name: failing[name] for name in worst}
             left = [name for name in left if name not in worst]
             near = {name for gone in worst for name in self._beside(gone, left)}
@@ -144,9 +145,9 @@ class _Trial:
         """Cameras whose move is not proved, of those asked about, by itself and with those left that overlap it."""
         failing: dict[str, CameraMove] = {}
         for name in asked:
-            own = self.held.compared((name,), ())
+            own = self.held.compared((name,))
             together = self._beside(name, left)
-            joint = self.held.compared(together, ()).sigmas
+            joint = self.held.compared(together).sigmas
             if own.gain < -MAX_GROWTH and own.sigmas < -MAX_GROWTH_SIGMAS:
                 reason = words.speaks_against(*self._size(name), -own.sigmas)
                 failing[name] = self.move(name, (name,), reason, "worse")
@@ -170,13 +171,14 @@ class _Trial:
         turn_deg, shift_m = objection.wish or (0.0, 0.0)
         return replace(move, rotation_deg=turn_deg, translation_mm=1e3 * shift_m)
 
-    def accepted(self, camera: str, moving: Sequence[str]) -> CameraMove:
-        """A move that is kept."""
+    def accepted(self, camera: str, moving: Sequence[str], T_world_cam: Pose) -> CameraMove:
+        """A move that is kept, to where the camera has been put."""
         together = self._beside(camera, moving)
         move = self.move(camera, together, "", "")
         gaps = (move.held_out_before_mm, move.held_out_after_mm)
-        reason = words.gained(*self._size(camera), gaps, move.gain_sigmas, len(together) - 1, move.prior_sigmas)
-        return replace(move, accepted=True, reason=reason)
+        turn_deg, shift_m = _size(self.case.start[camera], T_world_cam)
+        reason = words.gained(turn_deg, shift_m, gaps, move.gain_sigmas, len(together) - 1, move.prior_sigmas)
+        return replace(move, accepted=True, reason=reason, rotation_deg=turn_deg, translation_mm=1e3 * shift_m)
 
     def move(self, camera: str, together: Sequence[str], reason: str, refusal: Refusal) -> CameraMove:
         """What is told of a refused move.
@@ -197,12 +199,16 @@ class _Trial:
             translation_mm=1e3 * shift_m,
             held_out_before_mm=self.held.median_mm(camera, together),
             held_out_after_mm=self.held.median_mm(camera),
-            gain_sigmas=self.held.compared(together, ()).sigmas,
+            gain_sigmas=self.held.compared(together).sigmas,
             prior_sigmas=prior_sigmas(self.case, reg, camera),
             unobservable=reg.unobservable.get(camera, ()),
         )
 
     def _size(self, camera: str) -> tuple[float, float]:
-        """Turn [deg] and shift [m] of a camera's move."""
-        turn, shift = pose_distance(self.case.start[camera], self.held.registration.T_world_cam[camera])
-        return math.degrees(turn), shift
+        return _size(self.case.start[camera], self.held.registration.T_world_cam[camera])
+
+
+def _size(before: Pose, after: Pose) -> tuple[float, float]:
+    """Turn [deg] and shift [m] of a camera's move."""
+    turn, shift = pose_distance(before, after)
+    return math.degrees(turn), shift

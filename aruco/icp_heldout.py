@@ -21,7 +21,7 @@ import numpy as np
 
 from aruco.icp_equations import weighted
 from aruco.icp_normal import Normal, derivatives, scaled_inverse, summed
-from aruco.icp_rows import POSE, Index, Rows, followers
+from aruco.icp_rows import POSE, Index, Rows
 from aruco.icp_solve import Registration
 from aruco.pose_math import Array
 
@@ -60,14 +60,7 @@ class Estimate:
 
     def way(self, A: Array, b: Array) -> Array:
         """(size,) from here to the estimate under the constraint ``A x = b``."""
-        return -self._gain(A) @ (A @ self.x - b)
-
-    def bound(self, A: Array, b: Array) -> Estimate:
-        """The estimate under that constraint."""
-        return Estimate(x=self.x + self.way(A, b), P=self.P - self._gain(A) @ (A @ self.P))
-
-    def _gain(self, A: Array) -> Array:
-        return self.P @ A.T @ scaled_inverse(A @ self.P @ A.T)
+        return -self.P @ A.T @ scaled_inverse(A @ self.P @ A.T) @ (A @ self.x - b)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,29 +71,29 @@ class HeldOut:
     patch: Index  # (m,) of the scene, of each row
     fold: Index  # (m,) 0 to N_FOLDS - 1, one for each patch
     without: tuple[Normal, ...]  # of all rows but those of a fold, and of what is known beforehand
+    estimates: tuple[Estimate, ...]  # by each of these
+    P: Array  # (size, size) covariance by all rows
     J: csr_array  # (m, N_FOLDS * size) of gaps by the unknowns of their own fold's estimate
     shared: csr_array  # (m, c) of gaps by the errors that they share with others of their patch
-    memo: Memo
+    gap_m: Array  # (m,) gaps that the solution without a row's own share predicts for it
+    # What has been found already: asked for again and again.
+    memo: dict[frozenset[str], Comparison] = field(default_factory=dict)
 
-    def compared(self, before: Collection[str], after: Collection[str]) -> Comparison:
-        """Whether gaps shrink from some cameras' standing at their start to fewer cameras' doing so.
+    def compared(self, cameras: Collection[str]) -> Comparison:
+        """Whether gaps shrink from some cameras' standing at their start to nobody's doing so but the reference.
 
         The floor's own rows do not count. Both are judged by the same weights, those of the larger gap of each row:
         what loses weight under one solution must not be worth more under the other.
-
-        Args:
-            before: Cameras that stand at their start, those of ``after`` among them.
-            after: Fewer of them.
         """
-        key = frozenset(before), frozenset(after)
-        if key not in self.memo.comparisons:
-            self.memo.comparisons[key] = self._compared(*key)
-        return self.memo.comparisons[key]
+        key = frozenset(cameras)
+        if key not in self.memo:
+            self.memo[key] = self._compared(key)
+        return self.memo[key]
 
-    def _compared(self, before: frozenset[str], after: frozenset[str]) -> Comparison:
+    def _compared(self, cameras: frozenset[str]) -> Comparison:
         reg = self.registration
-        back = self._back(after, before)
-        new, change = self.gaps(after), self._changes(back)
+        back = self._back(cameras)
+        new, change = self.gap_m, self._changes(back)
         old = new + change
         changed = np.abs(change) > _CHANGE * np.sqrt(reg.rows.variance)
         here = np.flatnonzero(~reg.rows.is_floor & np.isin(self.patch, self.patch[changed]))
@@ -108,75 +101,44 @@ class HeldOut:
             return Comparison(gain=0.0, share=0.0, sigma=math.inf)
         rows = weighted(reg.rows.only(here), np.maximum(np.abs(old), np.abs(new))[here], reg.scale)
         # The way counts less where it is doubted; see _doubted.
-        weight = _weighted(rows, self.shared[here], self._changes(self._doubted(back, after))[here])
+        weight = _weighted(rows, self.shared[here], self._changes(self._doubted(back))[here])
         patch = np.unique(self.patch[here], return_inverse=True)[1].ravel()
         sums = np.stack([np.bincount(patch, weight * gaps[here]) for gaps in (old, change)], axis=1)
         return compared_scores(sums / reg.scale**2)
 
-    def median_mm(self, camera: str, kept: Collection[str] = (), more: Collection[str] = ()) -> float:
+    def median_mm(self, camera: str, cameras: Collection[str] = ()) -> float:
         """Median of absolute gaps between one camera's cloud and all others; NaN without any. See gaps."""
         rows = self.registration.rows
         here = rows.of(self.registration.layout.cameras.index(camera)) & ~rows.is_floor
-        return 1e3 * float(np.median(np.abs(self.gaps(kept, more)[here]))) if here.any() else float("nan")
+        return 1e3 * float(np.median(np.abs(self.gaps(cameras)[here]))) if here.any() else float("nan")
 
-    def gaps(self, kept: Collection[str] = (), more: Collection[str] = ()) -> Array:
+    def gaps(self, cameras: Collection[str] = ()) -> Array:
         """(m,) gaps [m] that the solution without a row's own share predicts for it.
 
         Args:
-            kept: Cameras that stand at their start, relative to the reference, besides those that the registration
-                keeps; their depth errors are estimated.
-            more: More of these, for once.
+            cameras: Who stands at their start, relative to the reference; depth errors are estimated with them there.
         """
-        key = frozenset(kept)
-        if key not in self.memo.gaps:
-            x = np.stack([estimate.x for estimate in self._estimates(key)[:N_FOLDS]])
-            self.memo.gaps[key] = self.registration.rows.gap_m + self._changes(x)
-        return self.memo.gaps[key] + self._changes(self._back(key, frozenset(more))) if more else self.memo.gaps[key]
+        return self.gap_m + self._changes(self._back(frozenset(cameras)))
 
     def _changes(self, x: Array) -> Array:
         """(m,) what changes (N_FOLDS, size) of the unknowns without each share make of the gaps in it [m]."""
         return np.asarray(self.J @ x.ravel())
 
-    def _back(self, kept: frozenset[str], more: frozenset[str]) -> Array:
-        """(N_FOLDS, size) the way from the solutions with some cameras kept to those with more of them."""
-        A, b = self._constraint(more - kept)
-        return np.stack([estimate.way(A, b) for estimate in self._estimates(kept)[:N_FOLDS]])
-
-    def _estimates(self, kept: frozenset[str]) -> tuple[Estimate, ...]:
-        """The estimates without each share, and that of everything, with some cameras kept."""
-        if kept not in self.memo.estimates:
-            if kept:
-                found = tuple(estimate.bound(*self._constraint(kept)) for estimate in self._estimates(frozenset()))
-            else:
-                reg = self.registration
-                found = tuple(_estimate(reg, normal) for normal in (*self.without, reg.clouds + reg.prior))
-            self.memo.estimates[kept] = found
-        return self.memo.estimates[kept]
-
-    def _constraint(self, kept: frozenset[str]) -> tuple[Array, Array]:
-        """(6 k, size), (6 k,) cameras stand at their start, relative to the reference: ``A x = b``."""
+    def _back(self, cameras: frozenset[str]) -> Array:
+        """(N_FOLDS, size) the way from the solutions to those with some cameras at their start."""
         reg, one = self.registration, np.eye(self.registration.layout.size)
-        names = sorted(kept - {*reg.kept, reg.reference})
-        A = [one[reg.layout.pose(name)] - one[reg.layout.pose(reg.reference)] for name in names]
-        return np.concatenate([one[:0], *A]), np.concatenate([np.zeros(0), *(reg.back[name] for name in names)])
+        names = sorted(cameras - {reg.reference})
+        A = np.concatenate([one[:0], *(one[reg.layout.pose(n)] - one[reg.layout.pose(reg.reference)] for n in names)])
+        b = np.concatenate([np.zeros(0), *(reg.back[name] for name in names)])
+        return np.stack([estimate.way(A, b) for estimate in self.estimates])
 
-    def _doubted(self, way: Array, kept: frozenset[str]) -> Array:
+    def _doubted(self, way: Array) -> Array:
         """(N_FOLDS, size) a way between solutions, less of it where only the share that is held out knows the way.
 
         A prediction has an error of its own, A C A^T with A the share's rows and C the covariance of what is free
         without the share. With R of the gaps, (R + A C A^T)^-1 A x = R^-1 A y where y = (C^-1 + A^T R^-1 A)^-1 C^-1 x.
         """
-        whole = self._estimates(kept)[N_FOLDS].P
-        return np.stack([whole @ (normal.H @ x) for normal, x in zip(self.without, way)])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Memo:
-    """What has been found already, by cameras that stand at their start: asked for again and again."""
-
-    estimates: dict[frozenset[str], tuple[Estimate, ...]] = field(default_factory=dict)
-    gaps: dict[frozenset[str], Array] = field(default_factory=dict)
-    comparisons: dict[tuple[frozenset[str], frozenset[str]], Comparison] = field(default_factory=dict)
+        return np.stack([self.P @ (normal.H @ x) for normal, x in zip(self.without, way)])
 
 
 def held_out(registration: Registration, *, seed: int = 0) -> HeldOut:
@@ -196,25 +158,28 @@ def held_out_by(registration: Registration, patch: Index, fold: Index) -> HeldOu
     rows, layout = registration.rows, registration.layout
     n_cells = int(max(rows.cell_a.max(initial=-1), rows.cell_b.max(initial=-1))) + 1
     parts = [summed(rows.only(fold != k), layout, n_cells, scale=registration.scale) for k in range(N_FOLDS)]
+    without = tuple(part + registration.prior for part in parts)
+    estimates = tuple(_estimate(registration, normal) for normal in without)
+    J = _by_fold(derivatives(rows, layout), layout.size, fold)
     return HeldOut(
         registration=registration,
         patch=patch,
         fold=fold,
-        without=tuple(part + registration.prior for part in parts),
-        J=_by_fold(derivatives(rows, layout), layout.size, fold),
+        without=without,
+        estimates=estimates,
+        P=_estimate(registration, registration.clouds + registration.prior).P,
+        J=J,
         shared=_shared(rows, patch, n_cells),
-        memo=Memo(),
+        gap_m=rows.gap_m + J @ np.concatenate([estimate.x for estimate in estimates]),
     )
 
 
 def _estimate(registration: Registration, normal: Normal) -> Estimate:
-    """The best of all unknowns but those that are frozen, cameras that the registration keeps being kept."""
-    reg, x0 = registration, np.zeros(registration.layout.size)
-    for name in {*reg.kept} - {reg.reference}:
-        x0[reg.layout.pose(name)] = reg.back[name]
-    M = followers(reg.layout, reg.kept, reg.reference, reg.frozen)
-    P = M @ scaled_inverse(M.T @ normal.H @ M) @ M.T
-    return Estimate(x=x0 - P @ (normal.g + normal.H @ x0), P=P)
+    """The best of all unknowns but those that are frozen."""
+    free = np.flatnonzero(~registration.frozen)
+    P = np.zeros_like(normal.H)
+    P[np.ix_(free, free)] = scaled_inverse(normal.H[np.ix_(free, free)])
+    return Estimate(x=-P @ normal.g, P=P)
 
 
 def _by_fold(J: csr_array, size: int, fold: Index) -> csr_array:

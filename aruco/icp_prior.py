@@ -7,7 +7,7 @@ Leaves    these sizes to icp_evidence, what clouds say to icp_equations.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -138,15 +138,11 @@ class Known:
                 chi2 += float(off @ W @ off)
         return Normal(H=H, g=g, chi2=chi2)
 
-    def parts(self, state: State, kept: Collection[str] = ()) -> dict[str, Part]:
-        """Each aspect of each pose without a covariance, poses with one, depth errors, lean, and what is certain.
-
-        Poses of kept cameras are left out: they were put where they are, so that they are there is no testimony for how
-        well poses are known.
-        """
+    def parts(self, state: State) -> dict[str, Part]:
+        """Each aspect of each pose without a covariance, poses with one, depth errors, lean, and what is certain."""
         groups: dict[str, list[Part]] = {}
         for c in self.layout.cameras:
-            for group, part in (*(() if c in kept else self._of_pose(state, c)), *self._of_bias(state, c)):
+            for group, part in (*self._of_pose(state, c), *self._of_bias(state, c)):
                 groups.setdefault(group, []).append(part)
         return {name: Part.joined(parts) for name, parts in groups.items()}
 

@@ -29,7 +29,7 @@ from aruco.icp_graph import apply_gravity_constraint, build_pose_graph, optimize
 from aruco.icp_headline import too_few
 from aruco.icp_match import overlapping_pairs
 from aruco.icp_pair import pairwise_icp
-from aruco.icp_prior import Prior, Scales
+from aruco.icp_prior import Prior
 from aruco.icp_solve import Registration, register
 from aruco.icp_types import CameraMove, ICPConfig, ICPMetrics, ICPResult
 from aruco.pose_math import Array, Pose, checked_pose
@@ -244,17 +244,14 @@ def _refined(given: Given, part: tuple[str, ...], pairs: Mapping[Pair, float]) -
     """A group brought together by the pairs that meet well enough."""
     clouds = {name: given.clouds[name] for name in part}
     within = {pair: area for pair, area in pairs.items() if pair[0] in part}
-    everything = _registered(given, clouds, within, ())
+    everything = _registered(given, clouds, within)
     good = {p: area for p, area in within.items() if everything.pairs[p].fitness >= given.config.min_fitness}
 
-    def again(kept: Collection[str], silent: Collection[str] = ()) -> Registration:
-        # A cloud that is set aside may have been why errors were thought to be large.
-        scales = first.scales if kept and not silent else None
-        return _registered(given, *set_aside(clouds, good, silent), kept, scales)
+    def again(silent: Collection[str]) -> Registration:
+        return _registered(given, *set_aside(clouds, good, silent))
 
-    first = everything if len(good) == len(within) else again(())
     verdict = judge(
-        first,
+        everything if len(good) == len(within) else again(()),
         clouds,
         # A bumped camera's move counts from where it was found; nobody else is blamed for how far that is.
         {**given.start, **given.begin},
@@ -270,13 +267,7 @@ def _refined(given: Given, part: tuple[str, ...], pairs: Mapping[Pair, float]) -
     return Part(cameras=part, verdict=verdict, pairs=results)
 
 
-def _registered(
-    given: Given,
-    clouds: Mapping[str, Cloud],
-    pairs: Mapping[Pair, float],
-    kept: Collection[str],
-    scales: Scales | None = None,
-) -> Registration:
+def _registered(given: Given, clouds: Mapping[str, Cloud], pairs: Mapping[Pair, float]) -> Registration:
     return register(
         clouds,
         {name: given.start[name] for name in clouds},
@@ -285,8 +276,6 @@ def _registered(
         given.config,
         floor=given.floor,
         reference=min(clouds),
-        kept=kept,
         begin=given.begin,
-        scales=scales,
         start_covariances=given.start_covariances,
     )

@@ -9,7 +9,7 @@ icp_cloud.Cloud.slopes), and three of the floor that all cameras see.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -125,22 +125,3 @@ class Rows:
     def of(self, camera: int) -> Mask:
         """(m,) rows in which a camera has part."""
         return (self.a == camera) | (self.b == camera)
-
-
-def followers(layout: Layout, kept: Collection[str], reference: str, frozen: Mask) -> Array:
-    """(size, k) of all unknowns by the free ones: kept cameras move as the reference does, frozen unknowns stay.
-
-    Args:
-        layout: Of the unknowns.
-        kept: Cameras whose place relative to the reference stays.
-        reference: One of the cameras.
-        frozen: (size,) unknowns that do not change.
-    """
-    full = np.eye(layout.size)
-    free = ~frozen
-    for name in kept:
-        if name != reference:
-            full[layout.pose(name), layout.pose(reference)] = np.eye(POSE)
-            free = free.copy()
-            free[layout.pose(name)] = False
-    return full[:, free]

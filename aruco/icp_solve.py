@@ -1,7 +1,8 @@
 """Clouds of several cameras brought together, with what the given poses and depth errors are known to.
 
 Owns      register, Registration: what it answers.
-Leaves    the way there to icp_steps, what pairs say to icp_information, whether a move may be believed to icp_gates.
+Leaves    the way there to icp_steps, what pairs say to icp_information, whether a move may be believed to icp_gates,
+          where cameras are put some of which stay to icp_placing.
 
 One linear Gaussian estimate, made anew about its own result until it stays: poses and depth errors of all cameras and
 one floor, from the gaps between all clouds that overlap, the floor that each camera sees, and what is known
@@ -10,7 +11,7 @@ beforehand. All cameras are free in it; the world is then moved back so that the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +22,12 @@ from aruco.icp_cloud import Cloud
 from aruco.icp_information import PairInformation, fit_of, pair_information, unobserved
 from aruco.icp_match import Matches
 from aruco.icp_normal import Normal, scaled_inverse
+from aruco.icp_placing import placed
 from aruco.icp_prior import Prior, Scales
-from aruco.icp_rows import POSE, Layout, Rows, followers
+from aruco.icp_rows import Layout, Rows
 from aruco.icp_steps import Fit, Pair, Setup, fitted, set_up
 from aruco.icp_types import ICPConfig
-from aruco.pose_math import Array, Pose, adjoint, invert_transform, log_se3
+from aruco.pose_math import Array, Pose, invert_transform, log_se3
 from aruco.uncertainty import carried
 
 __all__ = ["Normal", "PairInformation", "Prior", "Registration", "register"]
@@ -35,12 +37,14 @@ __all__ = ["Normal", "PairInformation", "Prior", "Registration", "register"]
 class Registration:
     """Poses and depth errors that bring the clouds together."""
 
-    T_world_cam: dict[str, Pose]  # the reference's and kept ones exactly as at the start
+    start: dict[str, Pose]  # T_world_cam before
+    start_covariance: dict[str, Array]  # (6, 6) of that, in the returned world
+    T_world_cam: dict[str, Pose]  # the reference's exactly as at the start
     bias: dict[str, Array]  # (4,) beyond the given one; see icp_cloud.Cloud.slopes
-    bias_covariance: dict[str, Array]  # (4, 4), other cameras standing where they stand
+    bias_covariance: dict[str, Array]  # (4, 4)
     covariance: dict[str, Array]  # (6, 6) of the poses returned, left perturbation in world axes
     reference: str
-    kept: tuple[str, ...]  # asked to be kept, or without overlap with the reference's part of the rig
+    unlinked: tuple[str, ...]  # no pairs link them with the reference
     floor: FloorPlane | None  # common, in the returned world
     pairs: dict[Pair, PairInformation]  # (a, b), a < b: source a, target b
     matches: dict[Pair, Matches]  # (source, target), both directions, at the end
@@ -55,7 +59,7 @@ class Registration:
     clouds: Normal  # of all rows
     prior: Normal  # of poses and depth errors, without clouds
     frozen: Mask  # (size,) unknowns that are not estimated
-    joint: Array  # (size, size) covariance of all unknowns, were the reference and kept cameras as free as the others
+    joint: Array  # (size, size) covariance of all unknowns, were the reference as free as the others
     back: dict[str, Array]  # camera -> (6,) twist that takes it to its start, relative to the reference
     T_out_own: Pose  # from the equations' world to the returned one
 
@@ -81,61 +85,53 @@ def register(
     *,
     floor: FloorPlane | None,
     reference: str,
-    kept: Collection[str] = (),
     begin: Mapping[str, Pose] | None = None,
-    scales: Scales | None = None,
     start_covariances: Mapping[str, Array] | None = None,
 ) -> Registration:
     """Bring clouds together.
 
     Args:
         clouds: Camera -> what it sees, given depth errors taken out.
-        start: Camera -> T_world_cam: where the estimate begins, and where kept cameras and the reference stay.
+        start: Camera -> T_world_cam: where the estimate begins, and where the reference stays.
         priors: Camera -> what is known of its pose.
         pairs: Of cameras (a < b) that see the same surfaces, with the area on the floor that they share.
         config: Scales, iterations, method, whether depth errors are estimated.
         floor: Common floor in the world of ``start``; None: there is none to go by.
         reference: The camera that does not move.
-        kept: Cameras that do not move either.
-        begin: Camera -> T_world_cam where the estimate begins for it in place of its start, if it is free to move.
-        scales: How large errors of poses and depth are; None: clouds tell, of poses by cameras that are free.
+        begin: Camera -> T_world_cam where the estimate begins for it in place of its start.
         start_covariances: Camera -> (6, 6) of its pose in ``start``, of depth too where that made it, for what is told
             of cameras that stay; default: that of the prior.
     """
-    setup = set_up(
-        clouds,
-        start,
-        priors,
-        pairs,
-        config,
-        floor=floor,
-        reference=reference,
-        kept=kept,
-        begin=begin,
-        told=scales,
-        start_covariances=start_covariances,
-    )
+    setup = set_up(clouds, start, priors, pairs, config, floor=floor, reference=reference, begin=begin)
     fit = fitted(setup)
     areas = dict(pairs) if isinstance(pairs, Mapping) else dict.fromkeys(setup.pairs, float("nan"))
-    return _answer(setup, fit, start, areas)
+    T_world_own = invert_transform(setup.T_own_world)
+    known = {name: carried(setup.known.covariance(name, fit.scales), T_world_own) for name in setup.layout.cameras}
+    told = {name: S for name, S in (start_covariances or {}).items() if name in known}
+    return placed(_answer(setup, fit, start, known | told, areas), ())
 
 
-def _answer(setup: Setup, fit: Fit, start: Mapping[str, Pose], areas: Mapping[Pair, float]) -> Registration:
+def _answer(
+    setup: Setup,
+    fit: Fit,
+    start: Mapping[str, Pose],
+    start_covariance: dict[str, Array],
+    areas: Mapping[Pair, float],
+) -> Registration:
     layout, reference, T = setup.layout, setup.reference, fit.state.T_world_cam
     prior = setup.known.normal(fit.state, fit.scales)
-    free = followers(layout, (), reference, setup.frozen)
-    joint = free @ scaled_inverse(free.T @ (fit.clouds.H + prior.H) @ free) @ free.T
+    joint = setup.M @ scaled_inverse(setup.M.T @ (fit.clouds.H + prior.H) @ setup.M) @ setup.M.T
     T_restored = setup.start.T_world_cam[reference] @ invert_transform(T[reference])
     T_out_own = invert_transform(setup.T_own_world) @ T_restored
-    returned = _returned(setup, fit, joint, T_restored)
-    still = {reference, *setup.kept}
     return Registration(
-        T_world_cam={name: start[name] if name in still else T_out_own @ T[name] for name in layout.cameras},
+        start={name: start[name] for name in layout.cameras},
+        start_covariance=start_covariance,
+        T_world_cam={name: T_out_own @ T[name] for name in layout.cameras},
         bias=fit.state.bias,
-        bias_covariance={name: returned[layout.bias(name), layout.bias(name)] for name in layout.cameras},
-        covariance=_covariances(setup, fit, returned),
+        bias_covariance={name: joint[layout.bias(name), layout.bias(name)] for name in layout.cameras},
+        covariance={},  # when cameras are placed
         reference=reference,
-        kept=setup.kept,
+        unlinked=setup.unlinked,
         floor=fit.state.plane.moved(T_out_own) if setup.floors else None,
         pairs={pair: _pair(setup, fit, pair, areas[pair]) for pair in setup.pairs},
         matches=fit.matches,
@@ -156,68 +152,6 @@ def _answer(setup: Setup, fit: Fit, start: Mapping[str, Pose], areas: Mapping[Pa
         },
         T_out_own=T_out_own,
     )
-
-
-def _returned(setup: Setup, fit: Fit, joint: Array, T_restored: Pose) -> Array:
-    """(size, size) of what is returned, in the own world: brought to where the reference and kept cameras stand.
-
-    With A x how far the cameras that stay are off their places beside the reference, their being forced there takes
-    G = P A^T (A P A^T)^-1 of their errors at the start, e, to all others, and the world's being moved back takes those
-    of the reference, R. So an error x becomes x + K (e - x) with K = (1 - R) G A + R. The start is made of less than
-    the estimate is, so E[x e^T] = P, and what comes out has the covariance P + K (S - P) K^T: what the start is worse
-    than estimated. That a pose was kept because no better one was proved does not make it any better.
-    """
-    layout, reference = setup.layout, setup.reference
-    poses = [layout.pose(name) for name in layout.cameras]
-    Ad = np.eye(layout.size)
-    R = np.zeros_like(Ad)
-    for at in poses:
-        Ad[at, at], R[at, layout.pose(reference)] = adjoint(T_restored), np.eye(POSE)
-    P = Ad @ joint @ Ad.T
-    still = (reference, *setup.kept)
-    here = np.concatenate([np.r_[layout.pose(name)] for name in still])
-    S = np.zeros((len(here), len(here)))
-    for k, name in enumerate(still):
-        at = slice(POSE * k, POSE * (k + 1))
-        S[at, at] = _start_covariance(setup, fit, name)
-    K = R
-    if setup.kept:
-        one = np.eye(layout.size)
-        A = np.vstack([one[layout.pose(name)] - one[layout.pose(reference)] for name in setup.kept])
-        GA = P @ A.T @ scaled_inverse(A @ P @ A.T) @ A
-        K = GA - R @ GA + R
-    P_here = P[np.ix_(here, here)]
-    worse = _at_least(S, P_here) - P_here
-    S_out: Array = P + K[:, here] @ worse @ K[:, here].T
-    return (S_out + S_out.T) / 2
-
-
-def _covariances(setup: Setup, fit: Fit, returned: Array) -> dict[str, Array]:
-    """(6, 6) of the poses returned; a camera that stays is known as it was at the start."""
-    out: dict[str, Array] = {}
-    for name in setup.layout.cameras:
-        at = setup.layout.pose(name)
-        stays = name in (setup.reference, *setup.kept)
-        S = carried(
-            _start_covariance(setup, fit, name) if stays else returned[at, at], invert_transform(setup.T_own_world)
-        )
-        out[name] = (S + S.T) / 2
-    return out
-
-
-def _start_covariance(setup: Setup, fit: Fit, camera: str) -> Array:
-    """(6, 6) of a camera at the start: as told, or as the prior has it."""
-    told = setup.start_covariance.get(camera)
-    return setup.known.covariance(camera, fit.scales) if told is None else told
-
-
-def _at_least(S: Array, least: Array) -> Array:
-    """A covariance that promises nowhere more than another does: models of its makers differ."""
-    L = np.linalg.cholesky(least)
-    whitened = np.linalg.solve(L, np.linalg.solve(L, S).T)
-    values, vectors = np.linalg.eigh((whitened + whitened.T) / 2)
-    back = L @ vectors
-    return back @ np.diag(np.maximum(values, 1.0)) @ back.T
 
 
 def _unobserved(setup: Setup, fit: Fit, camera: str, joint: Array) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ Leaves    rows to icp_equations, their sum to icp_normal, what the end of the wa
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,12 +18,11 @@ from aruco.icp_evidence import told_scales
 from aruco.icp_match import Matches, match
 from aruco.icp_normal import Normal, scaled_inverse, solved, summed
 from aruco.icp_prior import Known, Prior, Scales
-from aruco.icp_rows import BIAS, Layout, Rows, followers
+from aruco.icp_rows import BIAS, Layout, Rows
 from aruco.icp_smooth import corrected, smoothed
 from aruco.icp_starts import contradiction, other_starts
 from aruco.icp_types import VOXELS, ICPConfig, Pair
 from aruco.pose_math import Array, Pose, invert_transform, make_pose
-from aruco.uncertainty import carried
 
 # At each of the scales VOXELS, of how many samples one is looked up: neighbours share their errors anyway.
 _EVERY = (4, 4, 2)
@@ -41,7 +40,7 @@ class Setup:
 
     layout: Layout
     reference: str
-    kept: tuple[str, ...]
+    unlinked: tuple[str, ...]  # cameras that no pairs link with the reference
     config: ICPConfig
     clouds: dict[str, Cloud]  # taken about their surfaces
     surfaces: dict[str, Array]  # camera -> (n,) depth of these
@@ -50,11 +49,9 @@ class Setup:
     known: Known
     start: State
     begin: State  # where the way begins: at the start, but for cameras that are thought to stand elsewhere
-    start_covariance: dict[str, Array]  # (6, 6) of cameras at the start, where it is known apart from the prior's
     T_own_world: Pose
     frozen: Mask  # (size,) unknowns that are not estimated
     M: Array  # (size, k) all unknowns by the free ones
-    told: Scales | None  # how large errors are; None: clouds tell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,10 +78,7 @@ def set_up(
     *,
     floor: FloorPlane | None,
     reference: str,
-    kept: Collection[str],
     begin: Mapping[str, Pose] | None = None,
-    told: Scales | None = None,
-    start_covariances: Mapping[str, Array] | None = None,
 ) -> Setup:
     """See icp_solve.register."""
     layout, pairs = Layout(tuple(sorted(clouds))), tuple(sorted(pairs))
@@ -94,7 +88,6 @@ def set_up(
     floors = () if plane is None else tuple(name for name in names if clouds[name].is_floor.any())
     frozen = np.zeros(layout.size, dtype=bool)
     frozen[layout.floor] = not floors
-    stay = tuple(sorted(({*kept} | {*names} - _reachable(reference, pairs)) - {reference}))
     about = {name: smoothed(clouds[name]) for name in names}
     at_start = State(
         T_world_cam={name: T_own_world @ start[name] for name in names},
@@ -102,11 +95,11 @@ def set_up(
         floor=np.zeros(3) if plane is None else floor_parameters(plane, up),
         up=up,
     )
-    elsewhere = {name: T_own_world @ T for name, T in (begin or {}).items() if name in {*names} - {reference, *stay}}
+    elsewhere = {name: T_own_world @ T for name, T in (begin or {}).items() if name in {*names} - {reference}}
     return Setup(
         layout=layout,
         reference=reference,
-        kept=stay,
+        unlinked=tuple(sorted({*names} - _reachable(reference, pairs))),
         config=config,
         clouds={name: cloud for name, (cloud, _) in about.items()},
         surfaces={name: depth for name, (_, depth) in about.items()},
@@ -119,17 +112,15 @@ def set_up(
         ),
         start=at_start,
         begin=replace(at_start, T_world_cam={**at_start.T_world_cam, **elsewhere}),
-        start_covariance={name: carried(S, T_own_world) for name, S in (start_covariances or {}).items()},
         T_own_world=T_own_world,
         frozen=frozen,
-        M=followers(layout, stay, reference, frozen),
-        told=told,
+        M=np.eye(layout.size)[:, ~frozen],
     )
 
 
 def fitted(setup: Setup) -> Fit:
     """The most probable state: a coarse way from each start, and on from the best of their ends to the finest scale."""
-    ways = [_gone(setup, _met(setup, start, setup.told or Scales(), scale=0), 0) for start in _starts(setup)]
+    ways = [_gone(setup, _met(setup, start, Scales(), scale=0), 0) for start in _starts(setup)]
     fit = min(ways, key=lambda way: contradiction(way.rows, way.matches))
     for scale in range(1, len(VOXELS)):
         fit = _gone(setup, fit, scale)
@@ -139,7 +130,7 @@ def fitted(setup: Setup) -> Fit:
 def _starts(setup: Setup) -> Iterator[State]:
     begin = setup.begin
     yield begin
-    free = tuple(name for name in setup.layout.cameras if name not in (setup.reference, *setup.kept))
+    free = tuple(name for name in setup.layout.cameras if name not in (setup.reference, *setup.unlinked))
     finest = _reach(setup.config, len(VOXELS) - 1)
     for T_world_cam in other_starts(setup.known, begin.T_world_cam, free, finest, seed=setup.config.seed):
         yield replace(begin, T_world_cam=T_world_cam)
@@ -195,12 +186,11 @@ def _met(setup: Setup, state: State, scales: Scales, *, scale: int) -> Fit:
 def _stepped(setup: Setup, fit: Fit) -> tuple[State, Scales, float]:
     """The best state of the linear equations, by what scales, and how far it is in standard deviations."""
     M = setup.M
-    scales = setup.told or told_scales(setup.known, fit.state, fit.clouds, M, fit.scales, kept=setup.kept)
+    scales = told_scales(setup.known, fit.state, fit.clouds, M, fit.scales)
     total = fit.clouds + setup.known.normal(fit.state, scales)
     x = solved(total, M)
     sigma = np.sqrt(np.diag(scaled_inverse(M.T @ total.H @ M)))
-    z = M.T @ x / np.maximum(np.diag(M.T @ M), 1.0)
-    step = float(np.max(np.abs(z) / np.maximum(sigma, 1e-12), initial=0.0))
+    step = float(np.max(np.abs(M.T @ x) / np.maximum(sigma, 1e-12), initial=0.0))
     return fit.state.moved(x, setup.layout), scales, step
 
 

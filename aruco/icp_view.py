@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from aruco.depth_bias import DepthBias
-from aruco.depth_image import check_depth
 from aruco.depth_mask import mask_edges
 from aruco.depth_noise import (
     CORRELATION_PX,
@@ -23,9 +22,8 @@ from aruco.depth_noise import (
     DepthNoise,
     bias_prior,
 )
-from aruco.errors import InputError
 from aruco.floor_plane import Mask
-from aruco.floor_view import LEAN_PX, MAX_SIGMA_M, FloorSamples, checked_intrinsics, untrusted
+from aruco.floor_view import LEAN_PX, MAX_SIGMA_M, FloorSamples, depth_and_intrinsics, untrusted
 from aruco.icp_surface import Squares, mean_squares
 from aruco.pose_math import Array
 
@@ -62,12 +60,7 @@ def usable_view(camera: str, data: Mapping[str, Any], stride: int, bias: DepthBi
         InputError: They are no depth image with intrinsics of its own.
     """
     where = f"camera {camera}"
-    if "depth" not in data or "K" not in data:
-        raise InputError(
-            f"{where}: want its depth and the K of that depth, got {', '.join(sorted(data)) or 'nothing'}."
-        )
-    depth = check_depth(data["depth"], where)
-    K = checked_intrinsics(data["K"], depth.shape, where)
+    depth, K = depth_and_intrinsics(data, where)
     bias = data.get("bias") if bias is None else bias
     baseline = data.get("baseline")
     known = None if bias is None else bias.focal_baseline

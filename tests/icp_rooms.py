@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from floor_rooms import BASELINE_M, FLOOR, FOCAL_PX, WALLS, K, Wall, depth_image
 
+from aruco.floor_model import centre_jacobian
 from aruco.floor_plane import FloorPlane
 from aruco.icp_cloud import Cloud, cloud_of
 from aruco.icp_types import ICPConfig
@@ -29,8 +30,22 @@ def box(low: Sequence[float], high: Sequence[float]) -> tuple[Wall, ...]:
 
 
 BOX = box((-0.5, 0.0, -0.3), (0.4, 0.7, 0.5))
+# Small boxes at several places, of which several cameras see the same sides: something to hold yaw, x and z by.
+BOXES = (
+    FLOOR,
+    *WALLS,
+    *box((-0.9, 0.0, -0.3), (-0.2, 0.8, 0.3)),
+    *box((0.2, 0.0, 0.4), (0.9, 0.5, 1.0)),
+    *box((0.1, 0.0, -1.1), (0.8, 0.9, -0.4)),
+)
 TABLE = (Wall(1, 0.7, (-0.6, -0.6), (0.6, 0.6)),)
 FURNISHED = (FLOOR, *WALLS, *BOX)
+
+
+def covariance(T_world_cam: Pose, turn_deg: float, shift_mm: float) -> Array:
+    """(6, 6) left perturbation of a pose that is off by so much about and along each axis at its centre, one sigma."""
+    J = centre_jacobian(T_world_cam[:3, 3], inverse=True)
+    return J @ np.diag([np.radians(turn_deg) ** 2] * 3 + [(1e-3 * shift_mm) ** 2] * 3) @ J.T
 
 
 def camera_data(depth: Array, *, n_frames: int = 20) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import math
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,7 @@ from loguru import logger
 
 from aruco.errors import InputError
 from aruco.floor_plane import FloorPlane
-from aruco.icp_gates import Verdict, judge
 from aruco.icp_pair import cloud_of_points, plane_information
-from aruco.icp_prior import Scales
 from aruco.icp_registration import (
     ICPConfig,
     ICPResult,
@@ -34,7 +31,6 @@ from aruco.icp_registration import (
     pairwise_icp,
     refine_with_icp,
 )
-from aruco.icp_solve import Registration, register
 from aruco.icp_types import Method
 from aruco.pose_math import (
     Array,
@@ -577,32 +573,6 @@ def test_clouds_that_are_copies_of_one_another_move_nothing() -> None:
     # They meet as they are; a move of one could only be noise.
     assert pose_distance(refined["b"], T)[1] < 1e-3
     np.testing.assert_array_equal(refined["a"], T)
-
-
-def test_errors_are_as_large_as_pairs_tell_that_meet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With cameras kept it is what the round told that is judged, not one with pairs that were thrown out since."""
-    asked: list[tuple[int, Scales | None, Scales]] = []  # pairs, scales taken, scales answered
-
-    def registering(clouds: Any, start: Any, priors: Any, pairs: Any, config: Any, **more: Any) -> Registration:
-        found = register(clouds, start, priors, pairs, config, **more)
-        asked.append((len(pairs), more["scales"], found.scales))
-        bad = ("cam1", "cam2")
-        if bad in found.pairs:
-            found = replace(found, pairs={**found.pairs, bad: replace(found.pairs[bad], fitness=0.0)})
-        return found
-
-    def judging(*args: Any, register: Any, **more: Any) -> Verdict:
-        register(("cam2",))
-        return judge(*args, register=register, **more)
-
-    monkeypatch.setattr("aruco.icp_registration.register", registering)
-    monkeypatch.setattr("aruco.icp_registration.judge", judging)
-    truth, data = _rig(3, zoom=1)
-    start = disturbed(truth, np.random.default_rng(1), turn_deg=0.3, shift_m=0.006)
-    refine_with_icp(data, start, dict.fromkeys(truth, PLANE), ICPConfig(max_iterations=[2, 2, 2]))
-    assert [n for n, _, _ in asked[:3]] == [3, 2, 2]
-    assert asked[1][1] is None
-    assert asked[2][1] is asked[1][2]
 
 
 def test_depth_in_millimetres_is_told_and_moves_nothing() -> None:

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from floor_rooms import BASELINE_M, FLOOR, WALLS, Wall, cameras, depth_image, zoomed
-from icp_rooms import LEVEL, box
+from floor_rooms import BASELINE_M, FLOOR, Wall, cameras, depth_image, zoomed
+from icp_rooms import BOXES, LEVEL, covariance
 
 from aruco.depth_bias import DepthBias
 from aruco.depth_noise import bias_prior
-from aruco.floor_model import centre_jacobian
 from aruco.floor_plane import FloorPlane
 from aruco.icp_cloud import Cloud, cloud_of
 from aruco.icp_equations import LEAST_SCALE, State, floor_parameters, floor_rows, joined, pair_rows, residual_scale
 from aruco.icp_match import Matches, match, overlapping_pairs
 from aruco.icp_normal import summed
+from aruco.icp_placing import placed
 from aruco.icp_prior import ASPECTS, default_of
 from aruco.icp_rows import Layout, Rows
 from aruco.icp_smooth import smoothed
@@ -32,14 +32,6 @@ RIG = cameras()
 ZOOM = 2  # 640 x 360: cells of 28 px are a few centimetres
 FULL = ICPConfig(region="full", stride=4)
 NAMES = tuple(RIG)
-# Boxes at several places that several cameras see the same sides of: something to hold yaw, x and z by.
-STEPS = (
-    FLOOR,
-    *WALLS,
-    *box((-0.9, 0.0, -0.3), (-0.2, 0.8, 0.3)),
-    *box((0.2, 0.0, 0.4), (0.9, 0.5, 1.0)),
-    *box((0.1, 0.0, -1.1), (0.8, 0.9, -0.4)),
-)
 GOOD, ROUGH = (0.03, 2.0), (0.3, 8.0)  # degrees and mm about and along each axis
 
 
@@ -53,18 +45,13 @@ def off(size: tuple[float, float], seed: int) -> dict[str, Pose]:
     }
 
 
-def covariance(T: Pose, size: tuple[float, float]) -> Array:
-    J = centre_jacobian(T[:3, 3], inverse=True)
-    return J @ np.diag([np.radians(size[0]) ** 2] * 3 + [(1e-3 * size[1]) ** 2] * 3) @ J.T
-
-
 def data_of(name: str, walls: Sequence[Wall], disparity_px: float = 0.0) -> dict[str, Any]:
     depth = depth_image(RIG[name], walls, seed=NAMES.index(name), disparity_px=disparity_px, zoom=ZOOM)
     return {"depth": depth, "K": zoomed(ZOOM), "baseline": BASELINE_M / ZOOM, "n_frames": 20}
 
 
 @cache
-def seen(walls: tuple[Wall, ...] = STEPS, disparity_px: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> dict[str, Cloud]:
+def seen(walls: tuple[Wall, ...] = BOXES, disparity_px: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> dict[str, Cloud]:
     return {
         name: cloud_of(name, data_of(name, walls, disparity_px[k]), FULL, T_world_cam=T, floor=LEVEL)
         for k, (name, T) in enumerate(RIG.items())
@@ -76,15 +63,14 @@ def registered(
     start: Mapping[str, Pose],
     size: tuple[float, float] | None,
     *,
-    kept: Sequence[str] = (),
     config: ICPConfig = FULL,
 ) -> Registration:
     priors = {
-        name: Prior(T_world_cam=start[name], covariance=None if size is None else covariance(start[name], size))
+        name: Prior(T_world_cam=start[name], covariance=None if size is None else covariance(start[name], *size))
         for name in clouds
     }
     pairs = overlapping_pairs(clouds, start, config)
-    return register(clouds, start, priors, pairs, config, floor=LEVEL, reference="cam0", kept=kept)
+    return register(clouds, start, priors, pairs, config, floor=LEVEL, reference="cam0")
 
 
 def errors_mm(T_world_cam: Mapping[str, Pose]) -> dict[str, float]:
@@ -125,14 +111,14 @@ def test_good_poses_stay_good():
     assert mean_mm(found.T_world_cam) < mean_mm(start)
 
 
-def test_the_reference_and_kept_cameras_stay_to_the_last_bit():
+def test_the_reference_and_cameras_that_stay_are_where_they_were_to_the_last_bit(rough: Registration):
     start = off(ROUGH, 1)
-    found = registered(seen(), start, ROUGH, kept=["cam2"])
+    found = placed(rough, ["cam2"])
     for name in ("cam0", "cam2"):
         np.testing.assert_array_equal(found.T_world_cam[name], start[name])
-    assert found.kept == ("cam2",)
-    # As good as anything can be beside a reference and a camera that are wrong by themselves.
-    assert not np.array_equal(found.T_world_cam["cam1"], start["cam1"])
+    # Placed once more it is the same.
+    for name, T in placed(found, ["cam2"]).T_world_cam.items():
+        assert not np.array_equal(T, start[name]) or name in ("cam0", "cam2")
 
 
 def test_the_same_clouds_give_the_same_bytes(rough: Registration):
@@ -148,7 +134,7 @@ def test_a_world_that_points_down_gives_the_same_rig(rough: Registration):
     start = {name: flip @ T for name, T in off(ROUGH, 1).items()}
     Ad = adjoint(flip)
     priors = {
-        name: Prior(T_world_cam=T, covariance=Ad @ covariance(flip @ T, ROUGH) @ Ad.T) for name, T in start.items()
+        name: Prior(T_world_cam=T, covariance=Ad @ covariance(flip @ T, *ROUGH) @ Ad.T) for name, T in start.items()
     }
     floor = FloorPlane(np.array([0.0, -1.0, 0.0]), 0.0)
     pairs = overlapping_pairs(seen(), start, config)
@@ -161,16 +147,16 @@ def test_a_world_that_points_down_gives_the_same_rig(rough: Registration):
 def test_a_camera_without_overlap_is_kept():
     start = off(ROUGH, 1)
     pairs = [pair for pair in overlapping_pairs(seen(), start, FULL) if "cam3" not in pair]
-    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, ROUGH)) for name, T in start.items()}
+    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, *ROUGH)) for name, T in start.items()}
     found = register(seen(), start, priors, pairs, FULL, floor=LEVEL, reference="cam0")
-    assert found.kept == ("cam3",)
+    assert found.unlinked == ("cam3",)
     np.testing.assert_array_equal(found.T_world_cam["cam3"], start["cam3"])
 
 
 def test_a_place_to_begin_at_of_a_camera_that_takes_no_part_is_none():
     """Cameras that were found may be of another part of the rig, or have no cloud."""
     start = off(GOOD, 1)
-    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, GOOD)) for name, T in start.items()}
+    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, *GOOD)) for name, T in start.items()}
     pairs, config = overlapping_pairs(seen(), start, FULL), replace(FULL, max_iterations=[1, 1, 1])
     found, plain = (
         register(seen(), start, priors, pairs, config, floor=LEVEL, reference="cam0", begin=begin)
@@ -185,7 +171,7 @@ def test_without_floor_or_pairs_poses_stay():
     start = off(ROUGH, 1)
     priors = {name: Prior(T_world_cam=T) for name, T in start.items()}
     found = register(seen(), start, priors, [], FULL, floor=None, reference="cam0")
-    assert set(found.kept) == set(RIG) - {"cam0"}
+    assert set(found.unlinked) == set(RIG) - {"cam0"}
     assert found.floor is None
     for name, T in start.items():
         np.testing.assert_array_equal(found.T_world_cam[name], T)
@@ -245,7 +231,7 @@ def test_information_of_a_bare_floor_knows_tilt_and_height_alone():
 def test_depth_errors_are_estimated_with_the_poses():
     px = (0.0, 0.25, 0.0, -0.2)
     start = off(GOOD, 2)
-    found = registered(seen(STEPS, px), start, GOOD)
+    found = registered(seen(BOXES, px), start, GOOD)
     for k, name in enumerate(RIG):
         # 1 / z_true = 1 / z - d / (f B), with f B = 84 px m.
         error = found.bias[name][1] - px[k] / 84.0
@@ -253,10 +239,10 @@ def test_depth_errors_are_estimated_with_the_poses():
     # They are told from none.
     assert found.bias["cam1"][1] > 2.0 * np.sqrt(found.bias_covariance["cam1"][1, 1])
     assert mean_mm(found.T_world_cam) < mean_mm(start)
-    believed = {n: replace(c, bias_covariance=1e-8 * c.bias_covariance) for n, c in seen(STEPS, px).items()}
+    believed = {n: replace(c, bias_covariance=1e-8 * c.bias_covariance) for n, c in seen(BOXES, px).items()}
     plain = registered(believed, start, GOOD)
     # They are allowed for where they are not asked for, too.
-    silent = registered(seen(STEPS, px), start, GOOD, config=replace(FULL, depth_bias=False))
+    silent = registered(seen(BOXES, px), start, GOOD, config=replace(FULL, depth_bias=False))
     np.testing.assert_array_equal(silent.T_world_cam["cam2"], found.T_world_cam["cam2"])
     assert mean_mm(plain.T_world_cam) > mean_mm(found.T_world_cam)
 
@@ -265,7 +251,7 @@ def test_depth_errors_are_estimated_with_the_poses():
 def test_a_depth_error_that_is_known_for_certain_may_be_registered_with(known: Array):
     """Files may say so: sigmas of zero, or a correlation of one."""
     start, bias = off(GOOD, 2), DepthBias(covariance=known, focal_baseline=84.0)
-    sure = cloud_of("cam1", {**data_of("cam1", STEPS), "bias": bias}, FULL, T_world_cam=RIG["cam1"], floor=LEVEL)
+    sure = cloud_of("cam1", {**data_of("cam1", BOXES), "bias": bias}, FULL, T_world_cam=RIG["cam1"], floor=LEVEL)
     found = registered({**seen(), "cam1": sure}, start, GOOD)
     assert mean_mm(found.T_world_cam) < mean_mm(start)
     # Known to a part of what is usual still: no farther from what was said than that.
@@ -277,7 +263,7 @@ def test_a_depth_error_that_is_known_for_certain_may_be_registered_with(known: A
 
 def test_evidence_tells_rigs_with_depth_errors_from_those_without():
     px = (0.3, -0.25, 0.2, -0.3)
-    assert registered(seen(), RIG, GOOD).scales.bias < 0.6 < registered(seen(STEPS, px), RIG, GOOD).scales.bias
+    assert registered(seen(), RIG, GOOD).scales.bias < 0.6 < registered(seen(BOXES, px), RIG, GOOD).scales.bias
 
 
 def test_evidence_tells_rough_poses_from_good_ones():
@@ -458,18 +444,21 @@ def test_covariances_are_symmetric_and_positive(rough: Registration):
         np.testing.assert_allclose(S, S.T, atol=1e-15)
         assert np.linalg.eigvalsh(S).min() > 0
     # The reference is known as it was given.
-    np.testing.assert_allclose(rough.covariance["cam0"], covariance(off(ROUGH, 1)["cam0"], ROUGH), rtol=0.01, atol=1e-7)
+    np.testing.assert_allclose(
+        rough.covariance["cam0"], covariance(off(ROUGH, 1)["cam0"], *ROUGH), rtol=0.01, atol=1e-7
+    )
     assert rough.pair_sigma_mm("cam1", "cam2") == pytest.approx(rough.pair_sigma_mm("cam2", "cam1"), rel=0.3)
 
 
 def test_cameras_that_stay_are_known_as_they_were_told_to_be():
     start = off(ROUGH, 1)
-    levelled = {name: covariance(T, (0.1, 5.0)) for name, T in start.items()}
-    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, ROUGH)) for name, T in start.items()}
+    levelled = {name: covariance(T, 0.1, 5.0) for name, T in start.items()}
+    priors = {name: Prior(T_world_cam=T, covariance=covariance(T, *ROUGH)) for name, T in start.items()}
     pairs = overlapping_pairs(seen(), start, FULL)
     found, plain = (
-        register(
-            seen(), start, priors, pairs, FULL, floor=LEVEL, reference="cam0", kept=["cam3"], start_covariances=told
+        placed(
+            register(seen(), start, priors, pairs, FULL, floor=LEVEL, reference="cam0", start_covariances=told),
+            ["cam3"],
         )
         for told in (levelled, None)
     )
@@ -477,6 +466,6 @@ def test_cameras_that_stay_are_known_as_they_were_told_to_be():
         np.testing.assert_allclose(found.covariance[name], levelled[name], rtol=1e-6, atol=1e-12)
     for name in ("cam1", "cam2"):
         assert np.linalg.eigvalsh(found.covariance[name]).min() > 0
-        # Others are moved to where the reference stands, and are as well known as that.
+        # Others are moved to where those stand, and are as well known as that.
         assert np.trace(found.covariance[name]) < 0.7 * np.trace(plain.covariance[name])
         np.testing.assert_array_equal(found.T_world_cam[name], plain.T_world_cam[name])

@@ -17,7 +17,7 @@ from benchmarks.icp_outcomes import Outcome, Room, outcomes, plain_outcomes, spr
 from benchmarks.metric import Metric
 
 # Limits and priors of the registration were chosen on other rigs.
-FRESH = range(70, 80)
+FRESH = range(80, 90)
 # Of these, rooms without anything amid the cameras.
 N_SPARSE = 5
 # Of these, by the plain recipe, in either kind of room.
