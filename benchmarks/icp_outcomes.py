@@ -64,14 +64,15 @@ class Outcome:
 
     def growth(self, way: str) -> float:
         """How much worse a way has made it than it was given, in units of what counts as harm; below 0 is better."""
-        return _growth(self.before_mm, self.after_mm[way])
+        return harm(self.before_mm, self.after_mm[way])
 
     def growth_by_icp(self, way: str) -> float:
         """The same against what levelling had left."""
-        return _growth(self.levelled_mm[way], self.after_mm[way])
+        return harm(self.levelled_mm[way], self.after_mm[way])
 
 
-def _growth(before_mm: float, after_mm: float) -> float:
+def harm(before_mm: float, after_mm: float) -> float:
+    """How much an error has grown, in units of what counts as harm."""
     return (after_mm - before_mm) / max(HARM_SHARE * before_mm, HARM_MM)
 
 
