@@ -56,7 +56,7 @@ def with_holes(depth: Any, where: str) -> Depth:
         typical = float(np.median(image[measured]))
         raise InputError(
             f"{where}: half of the depth is beyond {typical:.0f}, which looks like millimetres and must be metres; "
-            "divide by 1000, or set depth_scale."
+            "divide it by 1000, or set depth_scale in the recording's camera_info and pool it again."
         )
     return (
         image if np.array_equal(measured, ~np.isnan(image)) else np.where(measured, image, np.nan).astype(image.dtype)

@@ -109,13 +109,13 @@ def _two_floors(step: FloorStep, consensus: Consensus, T_world_cam: Mapping[str,
             float(T_world_cam[n][:3, 3] @ up) - consensus.planes[n].distance_m / float(consensus.floor.normal @ up)
             for n in names
         ]
-        return f"camera{'s' if len(names) > 1 else ''} {', '.join(names)} at {np.mean(heights):.2f} m"
+        return f"camera{'s' if len(names) > 1 else ''} {', '.join(names)} at {np.mean(heights):.3f} m"
 
     others = sorted(consensus.planes.keys() - set(step.cameras))
     return (
-        f"The cameras see floors of two heights that are {abs(step.rise_m):.2f} m apart, more than poses and bias of "
-        f"depth explain: {told(step.cameras)}, {told(others)}, and neither is most of them; say with --height-range "
-        "which one is the floor."
+        f"The cameras see floors of two heights that are {abs(step.rise_m):.3f} m apart, tilts allowed for, more than "
+        f"poses and bias of depth explain: {told(step.cameras)}, {told(others)}, and neither is most of them; say with "
+        "--height-range which one is the floor, or leave out a camera that was bumped."
     )
 
 

@@ -149,7 +149,7 @@ def nothing_met(
              for name, cloud in clouds.items() if len(clouds) > 1}  # fmt: skip
     return replace(
         metrics,
-        message=why_nothing(len(poses), len(clouds), left_out),
+        message=why_nothing(len(poses), len(clouds), left_out, config),
         cameras=dict(sorted({**unmoved(left_out), **alone}.items())),
         per_pair_results=pairs_apart((), shared_areas(clouds, poses, config), poses, config),
     )

@@ -102,7 +102,9 @@ def _believed(
     left, refused = dict(found), dict[str, tuple[Pose, str]]()
     while True:
         poses, metrics = refined(left)
-        out = {name: why for name in left if (why := _refusal(name, metrics) or doubts(poses, metrics, name))}
+        out = {name: why for name in left if (why := _refusal(name, metrics))}
+        # Doubts only where nobody stands at a wrong start meanwhile, whom the others follow in part.
+        out = out or {name: why for name in left if (why := doubts(poses, metrics, name))}
         if not out:
             return (poses, metrics), refused
         for name, why in out.items():

@@ -46,6 +46,8 @@ def told_scales(known: Known, state: State, clouds: Normal, M: Array, current: S
     """
     parts = known.parts(state)
     unknown = [c for c in known.layout.cameras if not known.given(c)]
+    # What is set aside says nothing of how well poses are known: its factor is that of the others in the middle.
+    heard = [c for c in unknown if clouds.H[known.layout.pose(c), known.layout.pose(c)].any()] or unknown
     now = {
         **{default_of(aspect, c): 1.0 for aspect in ASPECTS for c in unknown} | dict(current.default),
         **{"given": current.given, "bias": current.bias, "lean": current.lean, "certain": 1.0},
@@ -54,8 +56,9 @@ def told_scales(known: Known, state: State, clouds: Normal, M: Array, current: S
     now.update(_told(clouds, parts, M, now, {name: values for name, values in _DEPTH.items() if name in parts}))
     told: dict[str, float] = {}
     for aspect in ASPECTS if unknown else ():
-        names = [default_of(aspect, c) for c in unknown]
+        names = [default_of(aspect, c) for c in heard]
         now.update(_told_defaults(clouds, parts, M, now, names))
+        told |= dict.fromkeys((default_of(aspect, c) for c in unknown), _middle(now, names))
         told |= {name: now[name] for name in names}
     if "given" in parts:
         now.update(_told(clouds, parts, M, now, {"given": _POSES}))

@@ -3,9 +3,10 @@
 Owns      the rounds of refusing, setting clouds aside and registering again; what is told of each camera.
 Leaves    held-out distances to icp_heldout, what else speaks against a move to icp_objections.
 
-A camera to whose move something speaks against has no say any more: its cloud is set aside, for it would pull the
-others to where it was not allowed to go. One whose move is merely not proved keeps its pose, and stays free in the
-estimate: held where it was it would pull the others to its own error. See icp_placing for where these then go.
+Where something besides held-out distances speaks against a move, the camera has no say any more: its cloud is set
+aside, for it would pull the others to where it was not allowed to go. One whose move these distances do not prove keeps
+its pose, and stays free in the estimate: held where it was it would pull the others to its own error. See icp_placing
+for where the others then go; what may be said against a pose is asked once more of that place.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from aruco import icp_words as words
 from aruco.floor_plane import FloorPlane
 from aruco.icp_cloud import Cloud
 from aruco.icp_heldout import HeldOut, held_out
-from aruco.icp_objections import Case, Objection, prior_sigmas, worst_objection
+from aruco.icp_objections import Case, Objection, objection_to_places, prior_sigmas, worst_objection
 from aruco.icp_placing import placed
 from aruco.icp_prior import Prior
 from aruco.icp_solve import Pair, Registration
@@ -110,7 +111,11 @@ def judge(
     moves.update(trial.unproved(moving))
     believed = [name for name in moving if name not in moves]
     registration = placed(registration, [name for name in moving if name not in believed])
-    moves.update({name: trial.accepted(name, believed, registration.T_world_cam[name]) for name in believed})
+    while objection := objection_to_places(case, registration, believed):
+        believed.remove(objection.camera)
+        moves[objection.camera] = trial.objected(objection, believed)
+        registration = placed(registration, [name for name in moving if name not in believed])
+    moves.update({name: trial.accepted(name, believed, registration) for name in believed})
     if registration.reference not in moves:
         moves[registration.reference] = CameraMove(accepted=False, reason=words.is_reference())
     return Verdict(registration=registration, moves=dict(sorted(moves.items())), left_out=tuple(left_out))
@@ -171,14 +176,19 @@ class _Trial:
         turn_deg, shift_m = objection.wish or (0.0, 0.0)
         return replace(move, rotation_deg=turn_deg, translation_mm=1e3 * shift_m)
 
-    def accepted(self, camera: str, moving: Sequence[str], T_world_cam: Pose) -> CameraMove:
-        """A move that is kept, to where the camera has been put."""
+    def accepted(self, camera: str, moving: Sequence[str], result: Registration) -> CameraMove:
+        """A move that is kept, to where the camera has been put in the end."""
         together = self._beside(camera, moving)
         move = self.move(camera, together, "", "")
         gaps = (move.held_out_before_mm, move.held_out_after_mm)
-        turn_deg, shift_m = _size(self.case.start[camera], T_world_cam)
-        reason = words.gained(turn_deg, shift_m, gaps, move.gain_sigmas, len(together) - 1, move.prior_sigmas)
-        return replace(move, accepted=True, reason=reason, rotation_deg=turn_deg, translation_mm=1e3 * shift_m)
+        turn_deg, shift_m = _size(self.case.start[camera], result.T_world_cam[camera])
+        return replace(
+            move,
+            accepted=True,
+            reason=words.gained(turn_deg, shift_m, gaps, move.gain_sigmas, len(together) - 1, move.prior_sigmas),
+            rotation_deg=turn_deg,
+            translation_mm=1e3 * shift_m,
+        )
 
     def move(self, camera: str, together: Sequence[str], reason: str, refusal: Refusal) -> CameraMove:
         """What is told of a refused move.

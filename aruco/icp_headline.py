@@ -178,7 +178,7 @@ def too_few(n_samples: int, least: int, config: ICPConfig) -> str:
     )
 
 
-def why_nothing(poses: int, clouds: int, left_out: Mapping[str, str]) -> str:
+def why_nothing(poses: int, clouds: int, left_out: Mapping[str, str], config: ICPConfig) -> str:
     """Why nothing can be registered."""
     if poses < 2:
         return f"Clouds of two cameras and more can be brought together, and there is a pose of {poses}."
@@ -190,5 +190,5 @@ def why_nothing(poses: int, clouds: int, left_out: Mapping[str, str]) -> str:
         )
     return (
         "No two cameras' clouds overlap: see that the poses are right and in metres, that cameras share a part of the "
-        "room, and that min_overlap_area is not too large."
+        f"room, and that they see {config.min_overlap_area:g} m2 of it in common (ICPConfig.min_overlap_area)."
     )

@@ -72,7 +72,6 @@ class HeldOut:
     fold: Index  # (m,) 0 to N_FOLDS - 1, one for each patch
     without: tuple[Normal, ...]  # of all rows but those of a fold, and of what is known beforehand
     estimates: tuple[Estimate, ...]  # by each of these
-    P: Array  # (size, size) covariance by all rows
     J: csr_array  # (m, N_FOLDS * size) of gaps by the unknowns of their own fold's estimate
     shared: csr_array  # (m, c) of gaps by the errors that they share with others of their patch
     gap_m: Array  # (m,) gaps that the solution without a row's own share predicts for it
@@ -138,7 +137,8 @@ class HeldOut:
         A prediction has an error of its own, A C A^T with A the share's rows and C the covariance of what is free
         without the share. With R of the gaps, (R + A C A^T)^-1 A x = R^-1 A y where y = (C^-1 + A^T R^-1 A)^-1 C^-1 x.
         """
-        return np.stack([self.P @ (normal.H @ x) for normal, x in zip(self.without, way)])
+        P = self.registration.joint
+        return np.stack([P @ (normal.H @ x) for normal, x in zip(self.without, way)])
 
 
 def held_out(registration: Registration, *, seed: int = 0) -> HeldOut:
@@ -167,7 +167,6 @@ def held_out_by(registration: Registration, patch: Index, fold: Index) -> HeldOu
         fold=fold,
         without=without,
         estimates=estimates,
-        P=_estimate(registration, registration.clouds + registration.prior).P,
         J=J,
         shared=_shared(rows, patch, n_cells),
         gap_m=rows.gap_m + J @ np.concatenate([estimate.x for estimate in estimates]),

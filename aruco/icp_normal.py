@@ -88,11 +88,9 @@ def derivatives(rows: Rows, layout: Layout) -> csr_array:
     return csr_array((values[inside], (m[inside], places[inside])), shape=(len(values), layout.size))
 
 
-def solved(normal: Normal, M: Array, x0: Array | None = None) -> Array:
-    """(size,) the best ``x = x0 + M z`` over all z."""
-    x0 = np.zeros(len(normal.g)) if x0 is None else x0
-    z = -scaled_inverse(M.T @ normal.H @ M) @ (M.T @ (normal.g + normal.H @ x0))
-    return x0 + M @ z
+def solved(normal: Normal, M: Array) -> Array:
+    """(size,) the best ``x = M z`` over all z."""
+    return -M @ (scaled_inverse(M.T @ normal.H @ M) @ (M.T @ normal.g))
 
 
 def scaled_inverse(A: Array) -> Array:

@@ -25,7 +25,15 @@ from aruco.icp_floor import MAX_COMMON_TILT_DEG, common_tilts_deg, floor_growth
 from aruco.icp_prior import Prior
 from aruco.icp_solve import Registration
 from aruco.icp_types import ICPConfig, Refusal
-from aruco.pose_math import Array, Pose, exp_so3, invert_transform, log_so3, make_pose, pose_distance
+from aruco.pose_math import (
+    Array,
+    Pose,
+    exp_so3,
+    invert_transform,
+    log_so3,
+    make_pose,
+    pose_distance,
+)
 
 # Chi-square that is exceeded once in a thousand, by degrees of freedom.
 CHI2_999 = {4: 18.47, 6: 22.46}
@@ -67,7 +75,7 @@ def worst_objection(case: Case, registration: Registration, moving: Sequence[str
     makes its cloud look wrong.
     """
     clouds = (registration.reference, *moving) if moving else ()
-    to_clouds = [o for name in clouds for o in _to_cloud(case, registration, name, moving)]
+    to_clouds = [o for name in clouds for o in _to_cloud(case, registration, name)]
     to_clouds = to_clouds or list(to_all_depths(case, registration, clouds))
     to_poses = [*_to_prior(case, registration, moving), *_to_size(case, registration, moving)]
     bumped = [o for o in to_poses if o.camera in {objection.camera for objection in to_clouds}]
@@ -79,9 +87,21 @@ def worst_objection(case: Case, registration: Registration, moving: Sequence[str
     return max(found, key=lambda objection: objection.excess) if found else None
 
 
-def _to_cloud(case: Case, registration: Registration, camera: str, moving: Sequence[str]) -> Iterator[Objection]:
+def objection_to_places(case: Case, registration: Registration, moving: Sequence[str]) -> Objection | None:
+    """The largest to where cameras have been put beside others that stay.
+
+    Priors are counted already where it is weighed who follows whom.
+    """
+    found = [
+        *_to_size(case, registration, moving),
+        *(o for name in moving for o in _to_floor(case, registration, name)),
+    ]
+    return max((o for o in found if o.camera in moving), key=lambda objection: objection.excess, default=None)
+
+
+def _to_cloud(case: Case, registration: Registration, camera: str) -> Iterator[Objection]:
     yield from _to_depth(case, registration, camera)
-    yield from _to_fit(registration, camera, moving)
+    yield from _to_fit(registration, camera)
 
 
 def _to_size(case: Case, registration: Registration, moving: Sequence[str]) -> Iterator[Objection]:
@@ -192,12 +212,9 @@ def _depth_error(registration: Registration, cloud: Cloud) -> tuple[float, float
     return float(np.median(np.abs(registration.bias[cloud.camera] @ slopes))), float(np.median(sigma))
 
 
-def _to_fit(registration: Registration, camera: str, moving: Sequence[str]) -> Iterator[Objection]:
-    """Over pairs of cameras none of which is kept: a kept one stands where its cloud may not fit."""
-    names, rows = registration.layout.cameras, registration.rows
-    counts = np.zeros(len(names) + 1, dtype=bool)  # the last is the floor
-    counts[[names.index(name) for name in (registration.reference, *moving)]] = True
-    gaps = rows.only(rows.of(names.index(camera)) & counts[rows.a] & counts[rows.b])
+def _to_fit(registration: Registration, camera: str) -> Iterator[Objection]:
+    rows = registration.rows
+    gaps = rows.only(rows.of(registration.layout.cameras.index(camera)) & ~rows.is_floor)
     if not len(gaps.gap_m):
         return
     misfit = float(np.median(np.abs(gaps.gap_m) / np.sqrt(gaps.variance))) / _MEDIAN_SIGMAS

@@ -154,7 +154,7 @@ def _brought_together(asked: _Asked, elsewhere: Mapping[str, Pose]) -> Answer:
     # A floor seen by a camera that stands elsewhere lies elsewhere.
     floor = _common_floor({name: plane for name, plane in asked.floor_planes.items() if name not in elsewhere}, at)
     clouds, left_out = _clouds(data, at, floor, asked.biases, asked.config)
-    left_out |= dict.fromkeys(poses.keys() - data.keys(), "there is no depth of it")
+    left_out |= dict.fromkeys(poses.keys() - data.keys(), "There is no depth of it.")
     pairs = overlapping_pairs(clouds, at, asked.config)
     metrics = ICPMetrics(success=False, num_pairs_attempted=len(pairs), reference_camera=min(poses, default=""))
     if not pairs:

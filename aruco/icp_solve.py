@@ -64,7 +64,10 @@ class Registration:
     T_out_own: Pose  # from the equations' world to the returned one
 
     def pair_covariance(self, a: str, b: str) -> Array:
-        """(6, 6) of the relative pose of two cameras: turn of b, shift of its centre, as seen from a, in world axes."""
+        """(6, 6) of the relative pose of two cameras as estimated: turn of b, shift of its centre, seen from a.
+
+        In world axes. Of cameras put beside others that stay it is a little more.
+        """
         # The equations' world is turned against the returned one by what the poses have changed: of no consequence.
         lever = centre_jacobian((invert_transform(self.T_out_own) @ self.T_world_cam[b])[:3, 3])
         J = np.zeros((6, self.layout.size))

@@ -114,13 +114,13 @@ class CameraMove:
 
     accepted: bool
     reason: str  # one sentence: why it moved or kept its pose
-    rotation_deg: float = 0.0  # of the move asked for, against the reference camera
+    rotation_deg: float = 0.0  # of the move, or of the one asked for and refused, against the reference camera
     translation_mm: float = 0.0  # of its centre
     held_out_before_mm: float = math.nan  # distance between clouds where it was not fitted: median of absolute values
     held_out_after_mm: float = math.nan
     # How significantly that of all cameras whose moves were proved together, this among them, shrank.
     gain_sigmas: float = math.nan
-    prior_sigmas: float = math.nan  # how far the move is from the given pose, in its covariance
+    prior_sigmas: float = math.nan  # how far the estimate is from the given pose, in its covariance
     unobservable: tuple[str, ...] = ()  # directions in which clouds say less than the given pose, in words
     refusal: Refusal = ""
     n_samples: int = 0  # of its depth that could be used

@@ -29,7 +29,7 @@ def gained(
 ) -> str:
     """Of a camera that was moved, proved together with others that overlap it."""
     before, after = gaps_mm
-    known = "" if prior_sigmas != prior_sigmas else f", {prior_sigmas:.1f} sigma from its given pose"
+    known = "" if prior_sigmas != prior_sigmas else f" (estimated {prior_sigmas:.1f} sigma from its given pose)"
     return (
         f"It was moved by {move(turn_deg, shift_m)}{known}: held-out distances to other clouds went from {before:.2f} "
         f"to {after:.2f} mm, and shrank by {sigmas:.1f} standard errors {_together(n_others)}."

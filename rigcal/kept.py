@@ -24,6 +24,7 @@ from rigcal.formats import native
 OF_CAMERAS = ("covariance", "depth_bias")
 # Of the largest entry: covariances are written with all digits, but by others perhaps not.
 SYMMETRIC = 1e-6
+NEGATIVE = 1e-9  # likewise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,4 +120,6 @@ def _covariance(numbers: Any, where: str) -> Array:
     largest = float(np.abs(covariance).max())
     if not (np.abs(covariance - covariance.T) <= SYMMETRIC * largest).all() or (np.diag(covariance) < 0).any():
         raise InputError(f"{where} is not symmetric with variances on its diagonal; mend or remove it.")
+    if largest > 0 and np.linalg.eigvalsh(covariance / largest)[0] < -NEGATIVE:
+        raise InputError(f"{where} has a negative variance in some direction; mend or remove it.")
     return covariance

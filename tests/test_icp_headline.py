@@ -136,11 +136,11 @@ def test_too_few_samples_name_the_count_and_what_to_change() -> None:
     told = too_few(83, 100, ICPConfig(voxel_size=0.5))
     for word in ("83 samples", "0.5 m", "want 100", "--icp-voxel-size", "hybrid"):
         assert word in told
-    both = why_nothing(2, 0, {"a": told, "b": too_few(7, 100, ICPConfig())})
+    both = why_nothing(2, 0, {"a": told, "b": too_few(7, 100, ICPConfig())}, ICPConfig())
     for word in ("a: 83 samples", "b: 7 samples", "--icp-voxel-size"):
         assert word in both
-    assert "a pose of 1" in why_nothing(1, 0, {})
-    assert "No two cameras' clouds overlap" in why_nothing(2, 2, {})
+    assert "a pose of 1" in why_nothing(1, 0, {}, ICPConfig())
+    assert "No two cameras' clouds overlap" in why_nothing(2, 2, {}, ICPConfig())
 
 
 # -- the contract with existing users: shared/contract.md lists names, order and defaults

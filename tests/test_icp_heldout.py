@@ -113,10 +113,14 @@ def shifted(rng: np.random.Generator) -> HeldOut:
     H = np.zeros((PAIR.size, PAIR.size))
     H[[X, Y], [X, Y]] = PRIOR_M**-2
     prior = Normal(H=H, g=np.zeros(PAIR.size), chi2=0.0)
+    clouds, free = summed(rows, PAIR, 2 * len(n)), np.ix_(~frozen, ~frozen)
+    joint = np.zeros_like(H)
+    joint[free] = np.linalg.inv((clouds.H + H)[free])
     registration: Any = SimpleNamespace(
         rows=rows,
         layout=PAIR,
-        clouds=summed(rows, PAIR, 2 * len(n)),
+        clouds=clouds,
+        joint=joint,
         prior=prior,
         reference="cam0",
         frozen=frozen,
