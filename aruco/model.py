@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,6 +148,15 @@ class Recording(Protocol):
 
     def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
         """A camera's frames at ascending indices into its stamps, one at a time; depth only when asked for."""
+        ...
+
+
+@runtime_checkable
+class KnowsUp(Protocol):
+    """A recording whose cameras measured gravity."""
+
+    def up_in_camera(self, camera: str) -> Array | None:
+        """(3,) unit vector against gravity in the camera's axes, over the whole recording; None: not measured."""
         ...
 
 
