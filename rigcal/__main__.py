@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from rigcal.convert_options import HELP, convert_options, export_choices, inputs_and_output, use_of
+
 
 @click.group(context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="rigcal")
@@ -59,6 +61,66 @@ def simulate(**given: Any) -> None:
             distortion=given["distortion"],
             depth=given["depth"],
         )
+
+
+@main.command(help=HELP)
+@convert_options
+@click.option("--debug", is_flag=True, help="Say more about what happens.")
+def convert(**given: Any) -> None:
+    """Convert a calibration, or a recording, or explain a format."""
+    use = use_of(given)
+    from rigcal import cli
+
+    with cli.telling_errors(debug=given["debug"]):
+        if use == "recording":
+            click.echo(_convert_recording(given))
+        elif use == "calibration":
+            click.echo(_convert_calibration(given))
+        else:
+            click.echo(_explained(given["explain"]))
+
+
+def _convert_calibration(given: dict[str, Any]) -> str:
+    from rigcal.exporting import export
+    from rigcal.formats.registry import format_named
+    from rigcal.formats.rig import ExportOptions
+    from rigcal.recordings import options_from
+
+    to = format_named(given["to"])
+    (calibration,), out = inputs_and_output(given)
+    return export(
+        calibration,
+        out,
+        to=to,
+        options=ExportOptions(**export_choices(given, to.takes)),
+        recordings=given["recordings"],
+        source_options=options_from(given),
+    )
+
+
+def _convert_recording(given: dict[str, Any]) -> str:
+    from rigcal import cli
+    from rigcal.exporting import refuse_calibration
+    from rigcal.recording_conversion import convert_recording
+    from rigcal.recordings import options_from
+
+    paths, out = inputs_and_output(given)
+    refuse_calibration(paths[0])
+    with cli.showing_progress() as progress:
+        return convert_recording(
+            paths,
+            out,
+            options=options_from(given),
+            every=given["every"] or 1,
+            depth=given["depth"],
+            progress=progress,
+        ).sentence
+
+
+def _explained(name: str | None) -> str:
+    from rigcal.formats.registry import NAMES, format_named
+
+    return format_named(name).explain if name else "\n".join(f"{n}: {format_named(n).explain}" for n in NAMES)
 
 
 if __name__ == "__main__":

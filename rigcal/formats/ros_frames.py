@@ -1,0 +1,155 @@
+"""Frames of ROS: how cameras' names become names of frames and back, and poses from a tree of transforms.
+
+Owns      which names ROS takes, the reversible spelling of all others, the note in a file that says how its frames
+          are named, walking a tree of transforms, parsing XML without its dangers.
+Leaves    what a launch file and a URDF look like to their own files.
+
+The world is REP-103's, Z up; a camera's frame is optical: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from loguru import logger
+
+from aruco.errors import InputError
+from aruco.pose_math import Pose
+from rigcal.formats.reading import read_text
+from rigcal.formats.rig import CAMERA_WORD, ExportOptions, Rig, filled, listed, y_up, y_up_of_z_up, z_up
+
+# A hall of a hundred cameras takes 100 kB.
+MAX_FILE_BYTES = 4 * 2**20
+_FRAME = re.compile("[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*")
+_NOTE = "Camera frames are named"
+_DEFAULT_PATTERNS = (ExportOptions().frame_name, "{camera}_optical_frame")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Link:
+    """A frame's place in its parent; without a pose it moves."""
+
+    parent: str
+    T_parent_child: Pose | None
+
+
+def frame_of(camera: str, pattern: str) -> str:
+    """The frame of a camera. What ROS does not take in a name is spelt ``_x<hex>_``, so that the name comes back."""
+    spelt = re.sub("[^A-Za-z0-9_]|_(?=x)", lambda found: f"_x{ord(found.group()):x}_", camera)
+    return filled(pattern, spelt)
+
+
+def camera_of(frame: str, pattern: str) -> str | None:
+    """The camera whose frame this is; None: the frame does not follow the pattern."""
+    first, second, *more = (re.escape(part) for part in pattern.split(CAMERA_WORD))
+    found = re.fullmatch("".join([first, "(?P<camera>.+)", second, *("(?P=camera)" + part for part in more)]), frame)
+    return re.sub("_x([0-9a-f]{1,6})_", _letter, found["camera"]) if found else None
+
+
+def _letter(found: re.Match[str]) -> str:
+    code = int(found.group(1), 16)
+    return chr(code) if code < 0x110000 else found.group()
+
+
+def frames_of(rig: Rig, options: ExportOptions, who: str) -> dict[str, str]:
+    """Camera -> frame.
+
+    Raises:
+        InputError: ROS does not take a name, or two frames have one name.
+    """
+    for option, frame in (("--parent-frame", options.parent_frame), ("--frame-name", filled(options.frame_name, "c"))):
+        if not _FRAME.fullmatch(frame):
+            raise InputError(
+                f"{who}: {option} does not give a name for a frame ({frame[:80]!r}), which has letters, digits and _, "
+                "parted by single slashes; choose another one."
+            )
+    frames = {camera: frame_of(camera, options.frame_name) for camera in rig.T_world_cam}
+    if options.parent_frame in frames.values():
+        raise InputError(
+            f"{who}: --parent-frame {options.parent_frame} is the frame of a camera as well; choose another one."
+        )
+    return frames
+
+
+def note(options: ExportOptions) -> str:
+    """The sentence by which a file says how its frames are named."""
+    return f"{_NOTE} {options.frame_name}"
+
+
+def upright(rig: Rig, who: str) -> dict[str, Pose]:
+    """T_world_cam of every camera in a world with Z up.
+
+    Raises:
+        InputError: Nobody knows what is up.
+    """
+    return {camera: z_up(T) for camera, T in y_up(rig, who).items()}
+
+
+def rig_of(links: Mapping[str, Link], text: str, path: Path) -> Rig:
+    """The cameras among the frames of a file's ``text``, in the world at the root of its tree, turned to Y up.
+
+    Args:
+        links: Every frame that has a parent -> where it is in it.
+        text: The file, which may say how the frames of cameras are named.
+        path: For messages.
+
+    Raises:
+        InputError: No frame is a camera's, they hang from several roots, or one hangs on something that moves.
+    """
+    cameras = _cameras(links, text, path)
+    placed = {camera: _placed(frame, links, path) for camera, frame in cameras.items()}
+    if len(roots := {root for root, _ in placed.values()}) > 1:
+        raise InputError(f"{path}: its cameras hang from several roots ({listed(roots)}); give a file with one world.")
+    return Rig(T_world_cam={camera: y_up_of_z_up(T) for camera, (_, T) in placed.items()}, up="+y")
+
+
+def _cameras(links: Mapping[str, Link], text: str, path: Path) -> dict[str, str]:
+    """Camera -> frame: by the pattern that the file states, else by the usual endings, else all ends of the tree."""
+    stated = re.search(f"{_NOTE} ([A-Za-z0-9_/{{}}]+)", text)
+    for pattern in (stated.group(1),) if stated and CAMERA_WORD in stated.group(1) else _DEFAULT_PATTERNS:
+        if found := {camera: frame for frame in links if (camera := camera_of(frame, pattern))}:
+            return found
+    parents = {link.parent for link in links.values()}
+    ends = {frame: frame for frame in links if frame not in parents}
+    if not ends:
+        raise InputError(f"{path}: holds no frame of a camera; give a file with a transform for each camera.")
+    logger.warning(
+        "{}: no frame is named as an optical one; {} are taken for cameras with z forward, x right, y down",
+        path,
+        listed(ends),
+    )
+    return ends
+
+
+def _placed(frame: str, links: Mapping[str, Link], path: Path) -> tuple[str, Pose]:
+    """The root above a frame, and the frame's pose in it."""
+    T_root_frame, at, seen = np.eye(4), frame, {frame}
+    while at in links:
+        link = links[at]
+        if link.T_parent_child is None:
+            raise InputError(f"{path}: frame {frame} hangs on {at}, which moves; give a file with fixed cameras.")
+        T_root_frame, at = link.T_parent_child @ T_root_frame, link.parent
+        if at in seen:
+            raise InputError(f"{path}: frame {frame} hangs in a circle of frames; mend its parents.")
+        seen.add(at)
+    return at, T_root_frame
+
+
+def parsed_xml(path: Path, what: str) -> tuple[str, ElementTree.Element]:
+    """An XML file's text and root; document types and entities, which can swell without end, are refused.
+
+    Raises:
+        InputError: It cannot be read, is no XML, or has a document type.
+    """
+    text = read_text(path, what, MAX_FILE_BYTES)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(f"{path}: has a DOCTYPE or ENTITY, which is not read; remove it, {what} needs none.")
+    try:
+        return text, ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: not readable as XML ({error}); give {what}.") from error

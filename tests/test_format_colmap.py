@@ -1,0 +1,176 @@
+"""COLMAP's text model: read back, and by COLMAP itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from format_rigs import format_rig, lens, pixels, points_before, worst_pose_difference
+
+from aruco.errors import InputError, OutputError
+from aruco.pose_math import invert_transform
+from rigcal.formats.colmap import FORMAT
+from rigcal.formats.rig import ExportOptions, Rig
+
+KINDS = {"a": "pinhole", "b12": "brown", "front": "brown_k3", "left": "rational", "z_fish": "fisheye"}
+# COLMAP's own arithmetic is double, as ours: a pixel of a thousand keeps 1e-12; its fisheye goes through atan2.
+PIXEL_TOLERANCE = 1e-6
+# Quaternions and (cx + 0.5) - 0.5 lose the last digits of a double.
+ROUND_TRIP = 1e-12
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return format_rig(KINDS)
+
+
+@pytest.fixture
+def folder(rig: Rig, tmp_path: Path) -> Path:
+    FORMAT.write(rig, tmp_path / "model", ExportOptions())
+    return tmp_path / "model"
+
+
+def _or_nan(pixel: np.ndarray | None) -> np.ndarray:
+    return np.full(2, np.nan) if pixel is None else pixel
+
+
+def colmap_pixels(folder: Path, rig: Rig) -> dict[str, np.ndarray]:
+    """Where COLMAP sees every camera's points, in COLMAP's pixels."""
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction()
+    model.read_text(str(folder))
+    found = {}
+    for image in model.images.values():
+        name = image.name.split("/")[0]
+        found[name] = np.array([_or_nan(image.project_point(p)) for p in points_before(rig, name)])
+    return found
+
+
+def test_what_was_written_comes_back(rig: Rig, folder: Path):
+    assert FORMAT.recognises(folder, b"")
+    back = FORMAT.read(folder)
+    assert worst_pose_difference(rig, back) < ROUND_TRIP
+    assert back.up is None
+    for name, camera in rig.cameras.items():
+        assert (back.cameras[name].width, back.cameras[name].height) == (1280, 720)
+        assert np.allclose(back.cameras[name].K, camera.K, rtol=0, atol=ROUND_TRIP)
+        points = points_before(rig, name)
+        assert np.allclose(pixels(back, name, points), pixels(rig, name, points), rtol=0, atol=1e-9)
+
+
+def test_colmap_projects_the_same_points_to_the_same_pixels(rig: Rig, folder: Path):
+    for name, found in colmap_pixels(folder, rig).items():
+        # COLMAP's first pixel has its centre at 0.5.
+        assert np.abs(found - 0.5 - pixels(rig, name, points_before(rig, name))).max() < PIXEL_TOLERANCE
+
+
+def test_a_pose_written_the_wrong_way_round_would_be_seen(rig: Rig, tmp_path: Path):
+    inverted = Rig(T_world_cam={n: invert_transform(T) for n, T in rig.T_world_cam.items()}, cameras=rig.cameras)
+    FORMAT.write(inverted, tmp_path / "wrong", ExportOptions())
+    for name, found in colmap_pixels(tmp_path / "wrong", rig).items():
+        off = np.abs(found - 0.5 - pixels(rig, name, points_before(rig, name)))
+        assert np.isnan(off).all() or np.nanmax(off) > 100
+
+
+def test_half_a_pixel_would_be_seen(rig: Rig, folder: Path):
+    for name, found in colmap_pixels(folder, rig).items():
+        assert np.abs(found - pixels(rig, name, points_before(rig, name))).min() > 0.4
+
+
+def test_the_rig_configuration_puts_the_cameras_where_the_images_are(rig: Rig, folder: Path):
+    pycolmap = pytest.importorskip("pycolmap")
+    (config,) = pycolmap.read_rig_config(str(folder / "rig_config.json"))
+    names = list(rig.T_world_cam)
+    assert [camera.image_prefix for camera in config.cameras] == [f"{name}/" for name in names]
+    assert [camera.ref_sensor for camera in config.cameras] == [True, False, False, False, False]
+    T_world_ref = rig.T_world_cam[names[0]]
+    for name, camera in zip(names[1:], config.cameras[1:], strict=True):
+        T_cam_ref = np.vstack([camera.cam_from_rig.matrix(), [0, 0, 0, 1]])
+        assert np.abs(T_world_ref @ invert_transform(T_cam_ref) - rig.T_world_cam[name]).max() < ROUND_TRIP
+    assert [camera.camera.model.name for camera in config.cameras] == [
+        "PINHOLE", "OPENCV", "FULL_OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE",
+    ]  # fmt: skip
+
+
+def test_images_can_be_called_as_they_are(rig: Rig, tmp_path: Path):
+    FORMAT.write(rig, tmp_path / "m", ExportOptions(image_name="shots/{camera}/image/17.png"))
+    assert "shots/left/image/17.png" in (tmp_path / "m/images.txt").read_text()
+    assert list(FORMAT.read(tmp_path / "m").T_world_cam) == list(rig.T_world_cam)
+    with pytest.raises(InputError, match="folder"):
+        FORMAT.write(rig, tmp_path / "n", ExportOptions(image_name="{camera}.jpg"))
+    with pytest.raises(InputError, match="path inside"):
+        FORMAT.write(rig, tmp_path / "n", ExportOptions(image_name="../{camera}/1.png"))
+    assert not (tmp_path / "n").exists()
+
+
+@pytest.mark.parametrize("name", ["../x", "a b", "a/b", "..", "a\nb"])
+def test_a_name_that_is_no_folder_is_refused(name: str, tmp_path: Path):
+    rig = Rig(T_world_cam={name: np.eye(4)}, cameras={name: lens(name, "pinhole")})
+    with pytest.raises(InputError, match="rename"):
+        FORMAT.write(rig, tmp_path / "m", ExportOptions())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_intrinsics_are_asked_for(tmp_path: Path):
+    with pytest.raises(InputError, match="--recording"):
+        FORMAT.write(Rig(T_world_cam={"a": np.eye(4)}), tmp_path / "m", ExportOptions())
+
+
+def test_an_earlier_model_is_replaced_and_nothing_else(rig: Rig, folder: Path):
+    FORMAT.write(format_rig({"only": "pinhole"}), folder, ExportOptions())
+    assert list(FORMAT.read(folder).T_world_cam) == ["only"]
+    assert [p.name for p in folder.parent.iterdir()] == ["model"]
+    (folder / "database.db").write_bytes(b"precious")
+    with pytest.raises(OutputError, match=r"database\.db"):
+        FORMAT.write(rig, folder, ExportOptions())
+    assert (folder / "database.db").read_bytes() == b"precious"
+
+
+def test_models_of_other_programs_are_read(tmp_path: Path):
+    (tmp_path / "cameras.txt").write_text("# x\n7 SIMPLE_RADIAL 640 480 500 320 240 0.1\n")
+    (tmp_path / "images.txt").write_text(
+        "#\n3 1 0 0 0 0 0 2 7 rig1/cam0/1.jpg\n10 20 -1 30 40 5\n4 -1 0 0 0 0 0 2 7 rig1/cam0/2.jpg\n\n"
+    )
+    rig = FORMAT.read(tmp_path)
+    assert list(rig.T_world_cam) == ["cam0"]
+    assert rig.T_world_cam["cam0"][:3, 3].tolist() == [0, 0, -2]
+    assert rig.cameras["cam0"].K[0].tolist() == [500, 0, 319.5]
+    assert rig.cameras["cam0"].distortion.tolist() == [0.1, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "images", "told"),
+    [
+        ("1 PINHOLE 640 480 500 500 320 240", "1 1 0 0 0 0 0 0 1 a/1\n\n2 1 0 0 0 1 0 0 1 a/2\n", "different places"),
+        ("1 PINHOLE 640 480 500 500 320", "1 1 0 0 0 0 0 0 1 a/1.png\n", "wants 4 parameters"),
+        ("1 FOV 640 480 500 500 320 240 1", "1 1 0 0 0 0 0 0 1 a/1.png\n", "no counterpart"),
+        ("1 PINHOLE 640 480 500 500 320 240", "1 2 0 0 0 0 0 0 1 a/1.png\n", "length"),
+        ("1 PINHOLE 640 480 500 500 320 240", "1 1 0 0 0 0 0 nan 1 a/1.png\n", "ordinary number"),
+        ("1 PINHOLE 640 480 500 500 320 240", "1 1 0 0 0 0 0 0 2 a/1.png\n", r"not in cameras\.txt"),
+        ("1 PINHOLE 640 480 500 500 320 240", "1 1 0 0 0 0 0 0 1\n", "got 9 words"),
+        ("1 PINHOLE 640 480 500 500 320 240", "1 1 0 0 0 0 0 0 1 ../1.png\n", "cannot be called"),
+        ("1 PINHOLE 640 480 500 500 320 240", "# none\n", "no image"),
+        ("1 PINHOLE 99999 480 500 500 320 240", "1 1 0 0 0 0 0 0 1 a/1.png\n", "99999 x 480"),
+    ],
+)  # fmt: skip
+def test_a_damaged_model_is_refused_in_one_sentence(cameras: str, images: str, told: str, tmp_path: Path):
+    (tmp_path / "cameras.txt").write_text(cameras + "\n")
+    (tmp_path / "images.txt").write_text(images)
+    with pytest.raises(InputError, match=told) as caught:
+        FORMAT.read(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_a_binary_model_is_recognised_and_the_cure_named(tmp_path: Path):
+    for name in ("cameras.bin", "images.bin"):
+        (tmp_path / name).write_bytes(b"\0")
+    with pytest.raises(InputError, match="model_converter"):
+        FORMAT.read(tmp_path)
+
+
+def test_a_damaged_rig_configuration_is_refused(folder: Path):
+    (folder / "rig_config.json").write_text(json.dumps({"cameras": []}))
+    with pytest.raises(InputError, match=r"rig_config\.json"):
+        FORMAT.read(folder)

@@ -1,0 +1,127 @@
+"""Camera trajectories, read by Open3D."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+import pytest
+from format_rigs import format_rig, pixels, points_before, worst_pose_difference
+from loguru import logger
+
+from aruco.errors import InputError
+from rigcal.formats import registry
+from rigcal.formats.open3d import FORMAT
+from rigcal.formats.rig import ExportOptions, Rig
+
+KINDS = {"front left": "pinhole", "34563472": "pinhole", "zwölf": "pinhole"}
+
+
+def written(rig: Rig, tmp_path: Path) -> Path:
+    FORMAT.write(rig, tmp_path / "cameras.json", ExportOptions())
+    return tmp_path / "cameras.json"
+
+
+def open3d_pixels(parameters: Any, points: np.ndarray, *, inverse: bool = False) -> np.ndarray:
+    """Open3D's convention: K (E p)."""
+    E = np.linalg.inv(parameters.extrinsic) if inverse else np.asarray(parameters.extrinsic)
+    p = points @ E[:3, :3].T + E[:3, 3]
+    q = p @ np.asarray(parameters.intrinsic.intrinsic_matrix).T
+    return q[:, :2] / q[:, 2:]
+
+
+def test_open3d_gets_the_same_pixels(tmp_path: Path) -> None:
+    rig = format_rig(KINDS)
+    trajectory = o3d.io.read_pinhole_camera_trajectory(str(written(rig, tmp_path)))
+    assert len(trajectory.parameters) == 3
+    for name, parameters in zip(sorted(KINDS), trajectory.parameters):
+        assert (parameters.intrinsic.width, parameters.intrinsic.height) == (1280, 720)
+        points = points_before(rig, name)
+        np.testing.assert_allclose(open3d_pixels(parameters, points), pixels(rig, name, points), atol=1e-6)
+        # The check can fail: the inverse, or a matrix read row by row, puts them elsewhere.
+        wrong = open3d_pixels(parameters, points, inverse=True)
+        assert np.abs(wrong - pixels(rig, name, points)).max() > 100
+
+
+def test_open3ds_renderer_sees_the_floor_where_it_is(tmp_path: Path) -> None:
+    """Not only its numbers: a point cloud projected by Open3D's own tensor code falls on the same pixels."""
+    rig = format_rig(KINDS)
+    trajectory = o3d.io.read_pinhole_camera_trajectory(str(written(rig, tmp_path)))
+    name, parameters = min(KINDS), trajectory.parameters[0]
+    points = points_before(rig, name, 5)
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points.astype(np.float32)))
+    image = cloud.project_to_depth_image(
+        1280,
+        720,
+        o3d.core.Tensor(np.asarray(parameters.intrinsic.intrinsic_matrix)),
+        o3d.core.Tensor(np.asarray(parameters.extrinsic)),
+        depth_scale=1000.0,
+        depth_max=10.0,
+    )
+    depth = np.asarray(image.to_legacy())
+    rows, cols = np.nonzero(depth)
+    for u, v in pixels(rig, name, points):
+        # Open3D rounds pixels down or to the nearest one.
+        assert np.hypot(cols - u, rows - v).min() < 1.5
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    for up in ("+y", "-y", None):
+        rig = format_rig(KINDS, up=up)
+        again = registry.read_rig(written(rig, tmp_path))
+        assert worst_pose_difference(again, rig) < 1e-14  # inverted twice: the last digit
+        assert again.up == up
+        assert all((again.cameras[name].K == camera.K).all() for name, camera in rig.cameras.items())
+
+
+def test_open3ds_own_files_are_read(tmp_path: Path) -> None:
+    rig = format_rig(KINDS)
+    trajectory = o3d.io.read_pinhole_camera_trajectory(str(written(rig, tmp_path)))
+    o3d.io.write_pinhole_camera_trajectory(str(tmp_path / "own.json"), trajectory)
+    own = registry.read_rig(tmp_path / "own.json")
+    assert list(own.T_world_cam) == ["cam0", "cam1", "cam2"]  # it keeps no names
+    for T, name in zip(own.T_world_cam.values(), sorted(KINDS)):
+        np.testing.assert_allclose(T, rig.T_world_cam[name], atol=1e-14)
+    o3d.io.write_pinhole_camera_parameters(str(tmp_path / "one.json"), trajectory.parameters[1])
+    one = registry.read_rig(tmp_path / "one.json")
+    np.testing.assert_allclose(one.T_world_cam["cam0"], own.T_world_cam["cam1"], atol=0)
+
+
+def test_distortion_is_not_dropped_silently(tmp_path: Path) -> None:
+    said: list[str] = []
+    logger.add(said.append, level="WARNING")
+    written(format_rig({"a": "pinhole", "b": "brown", "c": "fisheye"}), tmp_path)
+    assert len(said) == 1
+    assert "camera b, c" in said[0]
+    assert "undistorted" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("path_to", "value", "words"),
+    [
+        (("extrinsic",), [1.0] * 15, "must be 16 numbers"),
+        (("extrinsic",), [2.0] * 16, "rigid|rotation"),
+        (("intrinsic", "width"), "x", "whole number"),
+        (("intrinsic", "width"), 0, "image size"),
+        (("intrinsic", "intrinsic_matrix"), None, "list of numbers"),
+        (("intrinsic",), 5, "no intrinsic"),
+        (("name",), "34563472", "one name"),
+        (("name",), "_meta", "names that start with _"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_place(
+    path_to: tuple[str, ...], value: object, words: str, tmp_path: Path
+) -> None:
+    path = written(format_rig(KINDS), tmp_path)
+    content = json.loads(path.read_text())
+    node = content["parameters"][1]
+    for key in path_to[:-1]:
+        node = node[key]
+    node[path_to[-1]] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=words) as caught:
+        registry.read_rig(path)
+    assert str(path) in str(caught.value)

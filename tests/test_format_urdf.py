@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from loguru import logger
+from scipy.spatial.transform import Rotation
+from upright_rigs import SAME, SAME_PX, farthest, level_camera, pixels, points_before, random_rig
+
+from aruco.errors import InputError, OutputError
+from aruco.model import UpAxis
+from aruco.pose_math import make_pose
+from rigcal.formats.rig import ExportOptions, Rig
+from rigcal.formats.urdf import FORMAT
+
+DEFAULT = ExportOptions()
+ROS_OF_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+@pytest.fixture
+def warnings_said():
+    said: list[str] = []
+    logger.add(lambda message: said.append(str(message)), level="WARNING", format="{message}")
+    return said
+
+
+def joints(path: Path):
+    """Child link -> (parent link, rotation, translation), as URDF defines them: rpy about the fixed axes x, y, z."""
+    robot = ElementTree.parse(path).getroot()
+    assert robot.tag == "robot"
+    assert robot.get("name")
+    links = {link.get("name") for link in robot.iter("link")}
+    found = {}
+    for joint in robot.iter("joint"):
+        assert joint.get("type") == "fixed"
+        parent, child, origin = (joint.find(tag) for tag in ("parent", "child", "origin"))
+        assert parent is not None
+        assert child is not None
+        assert origin is not None
+        assert {parent.get("link"), child.get("link")} <= links
+        rpy, xyz = ([float(word) for word in origin.attrib[key].split()] for key in ("rpy", "xyz"))
+        found[child.get("link")] = parent.get("link"), Rotation.from_euler("xyz", rpy).as_matrix(), np.array(xyz)
+    assert len(links) == len(found) + 1  # a tree with one root
+    return found
+
+
+def urdf_of(tmp_path: Path, body: str):
+    path = tmp_path / "given.urdf"
+    path.write_text(f'<robot name="r">{body}</robot>')
+    return path
+
+
+def joint_of(parent: str, child: str, *, xyz: str = "0 0 0", rpy: str = "0 0 0", kind: str = "fixed"):
+    return (
+        f'<joint name="{child}_j" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/></joint>'
+    )
+
+
+# --- what the numbers mean
+
+
+def test_a_level_camera_above_the_floor_has_a_positive_z(tmp_path: Path):
+    FORMAT.write(Rig(T_world_cam={"1": level_camera(1.2)}, up="+y"), tmp_path / "r.urdf", DEFAULT)
+    parent, R, t = joints(tmp_path / "r.urdf")["1_left_camera_optical_frame"]
+    assert parent == "world"
+    assert t.tolist() == [0.0, 0.0, 1.2]
+    assert np.abs(R - np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])).max() < 1e-15
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("up", ["+y", "-y"])
+def test_points_land_on_the_same_pixels(tmp_path: Path, seed: int, up: UpAxis):
+    rig = random_rig(seed, up=up)
+    FORMAT.write(rig, tmp_path / "r.urdf", DEFAULT)
+    found = joints(tmp_path / "r.urdf")
+    for camera, T in rig.T_world_cam.items():
+        points = points_before(T)
+        truth = pixels(points, T[:3, :3], T[:3, 3])
+        _, R, t = found[f"{camera}_left_camera_optical_frame"]
+        y_up = points if up == "+y" else points * [1.0, -1.0, -1.0]
+        points_ros = y_up @ ROS_OF_Y_UP.T
+        assert np.abs(pixels(points_ros, R, t) - truth).max() < SAME_PX
+        # The same tolerance catches the inverse, a transposed rotation, rpy about moving axes, a world not turned.
+        rpy = Rotation.from_matrix(R).as_euler("xyz")
+        for R_wrong, t_wrong in ((R.T, -R.T @ t), (R.T, t), (Rotation.from_euler("XYZ", rpy).as_matrix(), t)):
+            assert np.abs(pixels(points_ros, R_wrong, t_wrong) - truth).max() > 1.0
+        assert np.abs(pixels(points, R, t) - truth).max() > 1.0
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
+@pytest.mark.parametrize("off", [0.0, 1e-15, 1e-10, 1e-8])
+def test_a_camera_in_gimbal_lock_keeps_its_pixels(tmp_path: Path, pitch: float, off: float):
+    for nth in range(20):
+        roll, yaw = np.random.default_rng(nth).uniform(-np.pi, np.pi, size=2)
+        R_ros = Rotation.from_euler("xyz", [roll, pitch - off, yaw]).as_matrix()
+        T = make_pose(ROS_OF_Y_UP.T @ R_ros, np.array([1.0, 2.0, 3.0]))
+        FORMAT.write(Rig(T_world_cam={"1": T}, up="+y"), tmp_path / "r.urdf", DEFAULT)
+        _, R, t = joints(tmp_path / "r.urdf")["1_left_camera_optical_frame"]
+        points = points_before(T)
+        seen = pixels(points @ ROS_OF_Y_UP.T, R, t)
+        assert np.abs(seen - pixels(points, T[:3, :3], T[:3, 3])).max() < SAME_PX
+
+
+# --- round trips
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("pattern", [DEFAULT.frame_name, "{camera}", "rig/{camera}/cam_{camera}"])
+def test_written_and_read_it_is_the_same_rig(tmp_path: Path, seed: int, pattern: str, warnings_said: list[str]):
+    rig = random_rig(seed, names=("34563472", "front_left", "cam-1 <é>&", "_x2d_", "x"))
+    options = ExportOptions(frame_name=pattern, parent_frame="map")
+    FORMAT.write(rig, tmp_path / "a.urdf", options)
+    once = FORMAT.read(tmp_path / "a.urdf")
+    assert once.up == "+y"
+    assert farthest(once.T_world_cam, rig.T_world_cam) < SAME
+    FORMAT.write(once, tmp_path / "b.urdf", options)
+    assert farthest(FORMAT.read(tmp_path / "b.urdf").T_world_cam, rig.T_world_cam) < SAME
+    assert not warnings_said
+
+
+# --- files of others
+
+
+def test_fixed_joints_that_hang_on_each_other_are_joined(tmp_path: Path, warnings_said: list[str]):
+    body = (
+        '<link name="base"/><joint name="bare" type="fixed"><parent link="base"/><child link="plate"/></joint>'
+        + joint_of("plate", "mast", xyz="5 0 0", rpy="0 0 0.5")
+        + joint_of("mast", "a_optical_frame", xyz="0 0 1.2", rpy="-1.5707963267948966 0 0")
+        + joint_of("mast", "arm", kind="revolute")
+        + joint_of("arm", "tool")
+    )
+    rig = FORMAT.read(urdf_of(tmp_path, body))
+    assert list(rig.T_world_cam) == ["a"]
+    T = rig.T_world_cam["a"]
+    assert np.abs(T[:3, 3] - [5.0, 1.2, 0.0]).max() < SAME
+    turn = Rotation.from_euler("y", 0.5).as_matrix()
+    assert np.abs(T[:3, :3] - turn @ level_camera(1.2)[:3, :3]).max() < SAME
+    assert not warnings_said
+
+
+def test_links_without_an_optical_name_are_read_with_a_warning(tmp_path: Path, warnings_said: list[str]):
+    rig = FORMAT.read(urdf_of(tmp_path, joint_of("world", "base") + joint_of("base", "tip")))
+    assert list(rig.T_world_cam) == ["tip"]
+    assert "tip" in warnings_said[0]
+
+
+# --- what cannot be used
+
+
+def test_what_cannot_be_written_is_refused_and_nothing_left(tmp_path: Path):
+    with pytest.raises(InputError, match=r"urdf .*--auto-align"):
+        FORMAT.write(random_rig(1, up=None), tmp_path / "r.urdf", DEFAULT)
+    with pytest.raises(InputError, match="--parent-frame"):
+        FORMAT.write(random_rig(1), tmp_path / "r.urdf", ExportOptions(parent_frame="a b"))
+    with pytest.raises(InputError, match="--frame-name"):
+        FORMAT.write(random_rig(1), tmp_path / "r.urdf", ExportOptions(frame_name="{camera}--"))
+    with pytest.raises(OutputError):
+        FORMAT.write(random_rig(1), tmp_path / "no" / "r.urdf", DEFAULT)
+    assert not list(tmp_path.iterdir())
+
+
+OPTICAL = "a_optical_frame"
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("", "holds no frame of a camera"),
+        ('<link name="world"/>', "holds no frame of a camera"),
+        (joint_of("world", OPTICAL, xyz="0 0"), "xyz must be 3 numbers, got 2"),
+        (joint_of("world", OPTICAL, rpy="0 0 nan"), "rpy must be an ordinary number"),
+        (joint_of("world", OPTICAL, xyz="${x} 0 0"), "xyz must be an ordinary number"),
+        (joint_of("world", OPTICAL, kind="continuous"), "which moves"),
+        (joint_of("world", "arm", kind="revolute") + joint_of("arm", OPTICAL), "hangs on arm, which moves"),
+        (joint_of("world", OPTICAL) * 2, "on another joint already"),
+        (joint_of("world", OPTICAL) + joint_of("other", "b_optical_frame"), "several roots (other, world)"),
+        (joint_of("x", OPTICAL) + joint_of(OPTICAL, "x"), "circle"),
+        (f'<joint name="j" type="fixed"><child link="{OPTICAL}"/></joint>', "names no parent"),
+        ('<joint name="j" type="fixed"><parent link="world"/><child/></joint>', "names no child"),
+        ('<x xmlns:xacro="http://www.ros.org/wiki/xacro"/>', "is a xacro file"),
+    ],
+)
+def test_joints_that_cannot_be_used_say_why(tmp_path: Path, body: str, message: str):
+    path = urdf_of(tmp_path, body)
+    with pytest.raises(InputError, match=re.escape(str(path))) as caught:
+        FORMAT.read(path)
+    assert message in str(caught.value)
+
+
+LAUGHS = '<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]><robot name="&b;"/>'
+
+
+@pytest.mark.parametrize(
+    ("raw", "message"),
+    [
+        (b"", "not readable as XML"),
+        (b"<robot>", "not readable as XML"),
+        (b"<sdf/>", "its root is <sdf>"),
+        (LAUGHS.encode(), "DOCTYPE"),
+        (LAUGHS.encode("utf-16"), "not UTF-8"),
+        (b'<?xml version="1.0" encoding="utf-7"?><robot>+ADwAIQ-DOCTYPE</robot>', "holds no frame"),
+        (b'<!DOCTYPE r SYSTEM "file:///etc/passwd"><robot/>', "DOCTYPE"),
+        (b"<robot>" + b"<a>" * 100_000, "not readable as XML"),
+        (b"<robot>" + b" " * 5 * 2**20 + b"</robot>", "over 4096 KiB"),
+    ],
+)
+def test_files_that_cannot_be_used_say_why(tmp_path: Path, raw: bytes, message: str):
+    path = tmp_path / "given.urdf"
+    path.write_bytes(raw)
+    with pytest.raises(InputError, match=re.escape(str(path))) as caught:
+        FORMAT.read(path)
+    assert message in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+def test_it_is_recognised_by_its_content(tmp_path: Path):
+    FORMAT.write(random_rig(1), tmp_path / "r.urdf", DEFAULT)
+    assert FORMAT.recognises(tmp_path / "r.urdf", (tmp_path / "r.urdf").read_bytes())
+    for head in (b"", b"<launch/>", b'{"a": "<robot"}', b"\xff\xfe<\x00r\x00"):
+        assert not FORMAT.recognises(tmp_path / "r.urdf", head)
