@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rigcal.depth_options import check_depth_options, depth_options
+from rigcal.source_options import source_options
 
 if TYPE_CHECKING:
     from aruco.model import Calibration
@@ -18,10 +19,11 @@ DOUBTFUL = 3  # exit code: poses were written, but not of every camera, or they 
 
 @click.command(context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
 @click.option("--svo", "svo", type=click.Path(path_type=Path), multiple=True,
-              help="A recording, or a folder of recordings; repeatable. Today any recording that --input reads; "
-                   "SVO files themselves cannot be read yet.")  # fmt: skip
+              help="A ZED recording (.svo, .svo2) or a folder of them; repeatable. The same as --input.")  # fmt: skip
 @click.option("-i", "--input", "inputs", type=click.Path(path_type=Path), multiple=True,
-              help="A recording: an RGB-D folder of all cameras, or of one camera; repeatable.")  # fmt: skip
+              help="A recording, or a folder of some of one kind: RGB-D folder, ZED SVO or SVO2, ROS bag, MCAP, video; "
+                   "repeatable.")  # fmt: skip
+@source_options
 @click.option("--markers", type=click.Path(path_type=Path), help="Marker map of the target (parquet).")
 @click.option("--board", metavar="SPEC",
               help="A board instead of a marker map: charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY, "
@@ -45,6 +47,9 @@ DOUBTFUL = 3  # exit code: poses were written, but not of every camera, or they 
               help="Which way the aligned world's y axis points up: +y up (default), or -y, the same world turned by "
                    "180 degrees about x, in which ZED Fusion files are written: y points down there and a camera 1.2 m "
                    "high stands at y = -1.2.")  # fmt: skip
+@click.option("--up-from", type=click.Choice(["target", "imu"]), default="target", show_default=True,
+              help="What tells which way is up: the target lying level (where the recording knows gravity, the verdict "
+                   "checks it), or the accelerometers of the cameras that have one (ZED).")  # fmt: skip
 @click.option("--sync-tolerance-ms", type=click.FloatRange(min=0), metavar="MS",
               help="How far apart frames of one moment may be. Default: half the slowest camera's frame period, at "
                    "most 100 ms.")  # fmt: skip
@@ -87,8 +92,12 @@ def main(**given: Any) -> None:
         raise click.UsageError("--refine-target estimates a marker map in the joint adjustment: it wants --markers, "
                                "and neither --board nor --no-joint")  # fmt: skip
     check_depth_options(given)
-    if not given["auto_align"] and (given["ground_face"] or given["ground_marker_id"] or given["up_axis"] != "+y"):
-        click.echo("warning: --ground-face, --ground-marker-id and --up-axis do nothing without --auto-align", err=True)
+    upright = ("ground_face", "ground_marker_id", "up_axis", "up_from")
+    if not given["auto_align"] and any(given[name] not in (None, "+y", "target") for name in upright):
+        click.echo("warning: --ground-face, --ground-marker-id, --up-axis and --up-from do nothing without "
+                   "--auto-align", err=True)  # fmt: skip
+    if given["up_from"] == "imu" and (given["ground_face"] or given["ground_marker_id"] is not None):
+        click.echo("warning: --ground-face and --ground-marker-id do nothing with --up-from imu", err=True)
     from rigcal import cli
 
     with cli.telling_errors(debug=given["debug"]):
@@ -100,6 +109,7 @@ def _run(given: dict[str, Any]) -> Calibration:
     from rigcal import cli
     from rigcal.calibrate_outputs import CalibrateOutputs
     from rigcal.pipeline import calibrate_files
+    from rigcal.recordings import options_from
 
     outputs = CalibrateOutputs.asked_for(given)
     with cli.showing_progress() as progress:
@@ -107,6 +117,7 @@ def _run(given: dict[str, Any]) -> Calibration:
             [*given["svo"], *given["inputs"]],
             given["markers"],
             cli.calibrate_config(given),
+            options=options_from(given),
             board=given["board"],
             fix=given["fix"],
             jobs=given["jobs"],

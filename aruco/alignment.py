@@ -406,18 +406,33 @@ def align_world(T_target_cam: Mapping[str, Pose], decision: UpDecision, *, up_ax
     Raises:
         InputError: Another up axis.
     """
-    if up_axis not in ("+y", "-y"):
-        raise InputError(f"--up-axis {up_axis}: known: +y, -y.")
-    R_align = rotation_align_vectors(decision.up_target, np.array([0.0, 1.0, 0.0]))
-    if up_axis == "-y":
-        R_align = np.diag([1.0, -1.0, -1.0]) @ R_align
     logger.info(
         "Detected ground face: {}, normal: {}, applying alignment", decision.ground_face, _shown(decision.up_target)
     )
-    poses = {name: apply_alignment_to_pose(T, R_align) for name, T in T_target_cam.items()}
+    world = turn_upright(T_target_cam, decision.up_target, up_axis=up_axis)
+    _warn_if_rolled(T_target_cam, decision.up_target)
+    return world
+
+
+def turn_upright(T_world_cam: Mapping[str, Pose], up_world: Array, *, up_axis: UpAxis = "+y") -> AlignedWorld:
+    """Turn the world so that a known direction becomes +Y, or -Y; see align_world.
+
+    Args:
+        T_world_cam: Camera -> (4, 4) pose.
+        up_world: (3,) direction against gravity in the same world.
+        up_axis: As for align_world.
+
+    Raises:
+        InputError: Another up axis.
+    """
+    if up_axis not in ("+y", "-y"):
+        raise InputError(f"--up-axis {up_axis}: known: +y, -y.")
+    R_align = rotation_align_vectors(up_world, np.array([0.0, 1.0, 0.0]))
+    if up_axis == "-y":
+        R_align = np.diag([1.0, -1.0, -1.0]) @ R_align
+    poses = {name: apply_alignment_to_pose(T, R_align) for name, T in T_world_cam.items()}
     for name, T in poses.items():
         logger.info("camera {}: up vector {} in the new world", name, _shown(-T[:3, 1]))
-    _warn_if_rolled(T_target_cam, decision.up_target)
     return AlignedWorld(R_align=R_align, T_world_cam=poses)
 
 

@@ -53,6 +53,7 @@ def calibrate_config(given: Mapping[str, Any]) -> CalibrateConfig:
             ground_face=given["ground_face"],
             ground_marker_id=given["ground_marker_id"],
             up_axis=given["up_axis"],
+            up_from=given.get("up_from", "target"),
         ),
         depth=DepthConfig(
             save=given["save_depth"] is not None,

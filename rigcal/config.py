@@ -48,6 +48,7 @@ class AlignConfig:
     ground_face: str | None = None
     ground_marker_id: int | None = None
     up_axis: UpAxis = "+y"
+    up_from: Literal["target", "imu"] = "target"  # what tells up: how the target lies, or the cameras' accelerometers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

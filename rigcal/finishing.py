@@ -15,6 +15,7 @@ from loguru import logger
 
 from aruco import alignment
 from aruco.errors import CalibrationError
+from aruco.gravity import UpByAccelerometers
 from aruco.marker_geometry import Face
 from aruco.model import Calibration, CameraPose
 from aruco.moved_alignment import find_up_moved
@@ -28,6 +29,7 @@ from rigcal.depth_scale import scale_from_depth
 from rigcal.depth_witness import DepthTestimony, hear_depth
 from rigcal.detecting import Seen
 from rigcal.evidence import Evidence
+from rigcal.gravity_witness import GravityTestimony, beside_world, hear_gravity, trusted_up
 from rigcal.kept import KeptRig
 from rigcal.kept_check import NOTHING_COMPARED, KeptCheck
 from rigcal.listeners import NOBODY, Listeners
@@ -71,14 +73,18 @@ def finish(
     depth = hear_depth(average, solved.rig, solved.joint, evidence, kept)
     listeners.agreement(depth.agreement, depth.corrected)
     solved = _corrected(solved, depth, evidence)
-    T_aligned_world, about = align(solved.rig, faces, config.align, moving=config.target_moves)
+    heard = hear_gravity(evidence.recording, solved.rig)
+    T_aligned_world, about = align(solved.rig, faces, config.align, moving=config.target_moves, heard=heard)
+    gravity = None if heard is None else beside_world(heard, T_aligned_world[:3, :3], config.align, kept.up)
     about.update(depth.notes)
+    if gravity is not None:
+        about["accelerometers"] = gravity.as_dict()
     rig = solved.rig.turned(T_aligned_world[:3, :3])
     if solved.joint is not None:
         about["adjusted"] = notes.adjustment(solved.joint)
         told = replace(solved.joint, rig=replace(solved.joint.rig, lost=rig.lost))
         guess = bool(about.get("aligned", {}).get("is_guess", False))
-        about["quality"] = assess(average, told, rig, evidence, check, up_is_guess=guess).as_dict()
+        about["quality"] = assess(average, told, rig, evidence, check, up_is_guess=guess, gravity=gravity).as_dict()
     stale = {name: check.doubtful.get(name, why) for name, why in _no_longer_fitting(average, rig, kept).items()}
     for name, why in stale.items():
         logger.warning("camera {} keeps its pose, but took no part: {}", name, why)
@@ -143,6 +149,7 @@ def assess(
     check: KeptCheck,
     *,
     up_is_guess: bool = False,
+    gravity: GravityTestimony | None = None,
 ) -> Quality:
     """The verdict, from what was held out; ``rig`` is the finished one, in its upright world if it has one."""
     config, geometry = evidence.config, evidence.target.geometry
@@ -159,6 +166,7 @@ def assess(
         kept=check,
         depth_scale=depth,
         up_is_guess=up_is_guess,
+        gravity=gravity,
         target_estimated=config.refine_target,
     )
 
@@ -176,25 +184,53 @@ def _times_s(evidence: Evidence) -> dict[int, float] | None:
     return {f: 1e-9 * (stamp - first) for f, stamp in stamps.items()}
 
 
-def align(rig: RigEstimate, faces: Sequence[Face], config: AlignConfig, *, moving: bool) -> tuple[Pose, dict[str, Any]]:
+def align(
+    rig: RigEstimate,
+    faces: Sequence[Face],
+    config: AlignConfig,
+    *,
+    moving: bool,
+    heard: UpByAccelerometers | None = None,
+) -> tuple[Pose, dict[str, Any]]:
     """The turn T_aligned_world into an upright world, and what to note about it; the identity unless asked for."""
     if not config.enabled:
         return np.eye(4), {}
     T_world_cam = {name: placement.T_world_cam for name, placement in rig.cameras.items()}
-    wish = {"ground_face": config.ground_face, "ground_marker_id": config.ground_marker_id}
-    if moving:
-        decision = find_up_moved(T_world_cam, rig.T_world_target, faces, **wish)
+    if config.up_from == "imu":
+        aligned = alignment.turn_upright(T_world_cam, trusted_up(heard), up_axis=config.up_axis)
+        note: dict[str, Any] = {"up_from": "imu", "is_guess": False}
     else:
-        decision = alignment.find_up(T_world_cam, faces, **wish)
-    aligned = alignment.align_world(T_world_cam, decision, up_axis=config.up_axis)
-    note = {
-        "ground_face": decision.ground_face,
-        "up_in_target": [float(x) for x in decision.up_target],
-        "margin": decision.margin,
-        "is_guess": decision.is_guess,
-        "camera_up": {name: [float(-x) for x in T[:3, 1]] for name, T in aligned.T_world_cam.items()},
-    }
+        decision = _up_of_target(rig, T_world_cam, faces, config, moving=moving, heard=heard)
+        aligned = alignment.align_world(T_world_cam, decision, up_axis=config.up_axis)
+        note = {
+            "up_from": "target",
+            "ground_face": decision.ground_face,
+            "up_in_target": [float(x) for x in decision.up_target],
+            "margin": decision.margin,
+            "is_guess": decision.is_guess,
+        }
+    note["camera_up"] = {name: [float(-x) for x in T[:3, 1]] for name, T in aligned.T_world_cam.items()}
     return make_pose(aligned.R_align, np.zeros(3)), {"aligned": note}
+
+
+def _up_of_target(
+    rig: RigEstimate,
+    T_world_cam: Mapping[str, Pose],
+    faces: Sequence[Face],
+    config: AlignConfig,
+    *,
+    moving: bool,
+    heard: UpByAccelerometers | None,
+) -> alignment.UpDecision:
+    wish = {"ground_face": config.ground_face, "ground_marker_id": config.ground_marker_id}
+    try:
+        if moving:
+            return find_up_moved(T_world_cam, rig.T_world_target, faces, **wish)
+        return alignment.find_up(T_world_cam, faces, **wish)
+    except CalibrationError as error:
+        if heard is None or heard.up_world is None:
+            raise
+        raise CalibrationError(f"{error} Or take up from the accelerometers with --up-from imu.") from error
 
 
 def _camera_poses(solved: _Solved, evidence: Evidence, T_aligned_world: Pose, kept: KeptRig) -> tuple[CameraPose, ...]:

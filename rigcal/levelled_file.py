@@ -18,6 +18,7 @@ from aruco.errors import InputError
 from aruco.model import UpAxis
 from aruco.pose_math import Array, Pose, pose_text
 from rigcal.formats import native
+from rigcal.gravity_witness import heard_again
 from rigcal.ground_doubts import GroundDoubts, judged
 from rigcal.kept import kept_of
 
@@ -172,6 +173,8 @@ def levelled_content(
         meta["quality"] = judged(meta["quality"], doubts)
     if isinstance(meta.get("aligned"), dict):
         meta["aligned"] = _aligned(meta["aligned"], T_world_cam)
+    if "accelerometers" in meta:
+        meta["accelerometers"] = heard_again(meta["accelerometers"], T_world_cam, given.up)
     if given.covariance:
         meta["covariance"] = {name: [float(x) for x in covariance[name].ravel()] for name in sorted(given.covariance)}
     return {**given.content, **entries, "_meta": {**meta, "ground_refined": dict(note)}}

@@ -22,14 +22,17 @@ from rigcal.config import CalibrateConfig, Resources
 from rigcal.depth_pooling import pool_recording, require_depth
 from rigcal.evidence import Evidence, at_rest, look
 from rigcal.finishing import finish
+from rigcal.gravity_witness import require_accelerometers
 from rigcal.kept import NOTHING_KEPT, KeptRig, kept_from_file
 from rigcal.kept_check import NOTHING_COMPARED, KeptCheck, compare_kept
 from rigcal.listeners import NOBODY, Listeners
 from rigcal.placing import place_with_target
 from rigcal.preview_writer import PreviewWriter
+from rigcal.recordings import plain_options
 from rigcal.solve.graph import GraphHealth, graph_health
 from rigcal.solve.target_shape import RefinedTarget
 from rigcal.sources import open_recordings
+from rigcal.sources.options import SourceOptions
 from rigcal.target import Target, board_target, marker_target_from_file
 
 
@@ -61,6 +64,8 @@ def calibrate(
     jobs = (resources or Resources()).jobs
     if config.depth.needed:
         require_depth(recording)
+    if config.align.enabled and config.align.up_from == "imu":
+        require_accelerometers(recording)
     evidence = look(recording, target, config, jobs=jobs, progress=progress, on_frame=listeners.frame)
     diagnosis.require_views(recording, target, config.detect, evidence.seen)
     if config.depth.needed:
@@ -108,6 +113,7 @@ def calibrate_files(
     markers: Path | None,
     config: CalibrateConfig,
     *,
+    options: SourceOptions | None = None,
     board: str | None = None,
     fix: Path | None = None,
     jobs: int | None = None,
@@ -115,7 +121,7 @@ def calibrate_files(
     preview: Path | None = None,
     listeners: Listeners = NOBODY,
 ) -> Calibration:
-    """The same, from files: recordings, a marker map or a board, and a folder for previews if they are wished."""
+    """The same, from files: recordings and how to read them, a marker map or a board, a folder for wished previews."""
     if board is None:
         assert markers is not None, "the command asks for one of them"
         target = marker_target_from_file(markers, config.detect.dictionary)
@@ -124,7 +130,7 @@ def calibrate_files(
     if config.align.enabled:
         alignment.specified_face(target.faces, config.align.ground_face, config.align.ground_marker_id)
     kept = NOTHING_KEPT if fix is None else kept_from_file(fix)
-    recording = open_recordings(paths)
+    recording = open_recordings(paths, options or plain_options())
     if preview is not None:
         listeners = replace(listeners, frame=PreviewWriter(preview, target.geometry))
     resources = Resources() if jobs is None else Resources(jobs=jobs)

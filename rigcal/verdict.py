@@ -15,6 +15,7 @@ from aruco.pose_math import Array, Pose, transform_points
 from aruco.rig_estimate import RigEstimate
 from aruco.uncertainty import camera_sigma, least_known
 from rigcal.depth_scale import DepthScale
+from rigcal.gravity_witness import GravityTestimony, gravity_readings, gravity_remarks
 from rigcal.kept_check import NOTHING_COMPARED, KeptCheck
 from rigcal.quality.gates import GATES, Measured, Quality, Reading, judge
 from rigcal.solve.repetition import places
@@ -45,6 +46,7 @@ def quality_of(
     kept: KeptCheck = NOTHING_COMPARED,
     depth_scale: DepthScale | None = None,
     up_is_guess: bool = False,
+    gravity: GravityTestimony | None = None,
     target_estimated: bool = False,
 ) -> Quality:
     """The verdict.
@@ -55,6 +57,7 @@ def quality_of(
         kept: What the views say about cameras that an earlier calibration placed.
         depth_scale: What depth cameras say of the marker map's scale, where there are any.
         up_is_guess: Whether up is that of a single frame of a moved target.
+        gravity: What accelerometers say of up, where the recording has them.
         target_estimated: Whether the marker map was corrected by the same frames.
     """
     v, joint = validation, validation.adjusted
@@ -70,7 +73,8 @@ def quality_of(
         *_kept(v, kept),
         *_heights(below_target_m or {}),
         *_scale(depth_scale),
-        *_up(up_is_guess),
+        *_up(up_is_guess and not (gravity is not None and gravity.confirms)),
+        *gravity_readings(gravity),
     ]
     return judge(
         Measured(
@@ -81,7 +85,7 @@ def quality_of(
             to_get_checked=_to_get_checked(v),
             # Motion bends residuals in all ways: what they look like then is no evidence for anything else.
             pattern=None if _taken_apart(v) else v.patterns.clearest,
-            remarks=(*_remarks(depth_scale), _intrinsics_remark(v)),
+            remarks=(*_remarks(depth_scale), *gravity_remarks(gravity), _intrinsics_remark(v)),
         )
     )
 

@@ -133,6 +133,11 @@ GATES: dict[str, Gate] = {
         Gate("focal length error noticed", "percent", 2.0, math.inf),
         # A target held askew tilts the world by as much; nothing in the images tells.
         Gate("up from one frame only", "", 0.0, math.inf),
+        # Accelerometers that nobody calibrated are within one degree, a target on a floor within half of one. At three
+        # degrees the far end of a room of 5 m is off by 26 cm.
+        Gate("up by accelerometers", "deg", 1.5, 3.0),
+        # One of them may be the odd one; if it is the pose, other checks see it too.
+        Gate("cameras whose accelerometer contradicts the others", "", 0.0, math.inf),
         # A target on a table has cameras below it; cameras in a mirrored world, or one upside down, stand deeper.
         Gate("camera below the target", "m", 0.5, 1.5),
     )

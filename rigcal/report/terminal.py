@@ -138,8 +138,11 @@ def _world(calibration: Calibration) -> str:
     if calibration.up is None:
         return "World: the target's frame; which way is up is not known (--auto-align turns it upright)."
     way = "up, against gravity" if calibration.up == "+y" else "down, along gravity (ZED Fusion's frame)"
-    face = calibration.notes.get("aligned", {}).get("ground_face", "?")
-    return f"World: origin in the target, y points {way}; level face: {face}."
+    aligned = calibration.notes.get("aligned", {})
+    by = (
+        "by the accelerometers" if aligned.get("up_from") == "imu" else f"level face: {aligned.get('ground_face', '?')}"
+    )
+    return f"World: origin in the target, y points {way}; {by}."
 
 
 def show_errors(

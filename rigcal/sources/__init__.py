@@ -1,7 +1,7 @@
 """Recordings: what can be read, and opening it.
 
-Owns      choosing the reader of a path, and joining several recordings into one.
-Leaves    each format to its own file, imported only when chosen.
+Owns      finding the recordings at a path, choosing their readers by what the files hold, opening them as one.
+Leaves    each format to its own file, imported only when asked; joining to joined; what is no recording to unknown.
 """
 
 from __future__ import annotations
@@ -9,106 +9,198 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from aruco.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from aruco.model import BadFrame, Camera, Frame, Recording
+    from aruco.model import Recording
+    from rigcal.sources.options import SourceOptions
 
 __all__ = ["open_recordings"]
 
-# Known by their suffix, but not readable yet.
-SVO_SUFFIXES = (".svo", ".svo2")
+# What readers are shown of a file.
+HEAD_BYTES = 64 * 2**10
+# Of files that lie beside recordings in a folder; a file that is named itself is looked into whatever its suffix.
+NEVER_RECORDINGS = frozenset(
+    f".{suffix}"
+    for suffix in (
+        *("png", "jpg", "jpeg", "npy", "yaml", "yml", "json", "csv", "toml", "txt", "md", "conf"),
+        *("parquet", "h5", "hdf5", "html", "zip", "py"),
+    )
+)
+# What an interrupted write leaves.
+UNFINISHED_SUFFIX = ".part"
+# Its state, in a folder that a conversion was interrupted in; see rigcal.recording_conversion.
+STATE_FILE = "conversion.json"
 
 
-def open_recordings(paths: Sequence[Path]) -> Recording:
+class _Reader(Protocol):
+    """A module that reads one format."""
+
+    def recognises(self, path: Path, head: bytes) -> bool: ...
+
+    def opened(self, path: Path, options: SourceOptions) -> Recording: ...
+
+
+class _Found(NamedTuple):
+    """A recording that is not yet opened."""
+
+    path: Path
+    kind: str  # recordings of one folder are of one kind
+    reader: _Reader
+
+
+def open_recordings(paths: Sequence[Path], options: SourceOptions | None = None) -> Recording:
     """Open one or more recordings as one.
 
     Args:
-        paths: Recordings, cameras of recordings, or folders of recordings.
+        paths: Recordings of any format, cameras of recordings, or folders of recordings of one kind.
+        options: What readers are told besides the path; None: the defaults.
 
     Returns:
         A recording with the cameras of all of them.
 
     Raises:
         InputError: A path cannot be read as a recording, or two of them have a camera of one name.
+        MissingExtraError: A format's optional package is not installed.
     """
-    opened = [pair for path in paths for pair in _open(Path(path))]
-    if not opened:
-        raise InputError("no recording given; give at least one RGB-D folder.")
-    return opened[0][1] if len(opened) == 1 else _Joined(opened)
+    found = [one for path in paths for one in _found(Path(path))]
+    if not found:
+        raise InputError("no recording given; give at least one recording, or a folder of recordings.")
+    from rigcal.sources.joined import joined
+    from rigcal.sources.options import SourceOptions
+
+    return joined(_opened(found, options or SourceOptions()))
 
 
-def _open(path: Path) -> list[tuple[Path, Recording]]:
-    """The recordings at a path, each with the path that it was found at."""
+def _opened(found: Sequence[_Found], options: SourceOptions) -> list[tuple[Path, Recording]]:
+    """Each recording with where it lies; all videos are one, because they may have one clock and one calibration."""
+    videos = [one.path for one in found if one.kind == "video"]
+    opened = [(one.path, _with_sdk_or_without(one, options)) for one in found if one.kind != "video"]
+    if videos:
+        from rigcal.sources import video
+
+        place = videos[0] if len(videos) == 1 else Path(os.path.commonpath([path.resolve() for path in videos]))
+        opened.append((place, video.opened_together(videos, options)))
+    return opened
+
+
+def _with_sdk_or_without(found: _Found, options: SourceOptions) -> Recording:
+    """The SDK knows its own files best; depth by semi-global matching is only to be had without it."""
+    if found.kind == "ZED" and not options.stereo_depth:
+        from rigcal.sources import zed_sdk
+
+        if zed_sdk.is_available():
+            return zed_sdk.opened(found.path, options)
+    return found.reader.opened(found.path, options)
+
+
+def _found(path: Path) -> list[_Found]:
+    """The recordings at a path; raises InputError where there is none."""
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder; give a recording.")
-    if not os.path.isdir(path):
-        raise _unreadable_file(path)
-    from rigcal.sources.rgbd_folder import RgbdFolder, is_rgbd_folder
+    from rigcal.sources.unknown import unfinished, unknown_file
 
-    if is_rgbd_folder(path):
-        return [(path, RgbdFolder(path))]
-    children = sorted(path.iterdir())
-    # A folder.part is what an interrupted write leaves.
-    folders = [child for child in children if child.is_dir() and child.suffix != ".part" and is_rgbd_folder(child)]
-    if folders:
-        return [(folder, RgbdFolder(folder)) for folder in folders]
-    for child in children:
-        if child.suffix.lower() in SVO_SUFFIXES:
-            raise _unreadable_file(child)
-    return [(path, RgbdFolder(path))]  # raises, and says what such a folder has
+    if os.path.isdir(path):
+        if (path / STATE_FILE).is_file() and path.suffix == UNFINISHED_SUFFIX:
+            raise unfinished(path)
+        return _in_folder(path)
+    if not path.is_file():  # opening a pipe would wait for ever
+        raise InputError(f"{path}: is neither a file nor a folder; give a recording.")
+    one = _file(path)
+    if one is None:
+        raise unknown_file(path, _head(path))
+    return [one]
 
 
-def _unreadable_file(path: Path) -> InputError:
-    if path.suffix.lower() in SVO_SUFFIXES:
-        return InputError(
-            f"{path}: SVO files cannot be read by this version yet; export the recording to an RGB-D folder "
-            "(<camera>/camera_info.yaml and <camera>/image/<stamp_ns>.png) and give that folder."
-        )
-    return InputError(f"{path}: not a recording that is known here; known: a folder of RGB-D images (RGB-D folder).")
+def _in_folder(path: Path) -> list[_Found]:
+    whole = _folder(path)
+    if whole is not None:
+        return [whole]
+    inside = list(_children(path))
+    kinds = sorted({one.kind for one in inside})
+    if len(kinds) > 1:
+        examples = ", ".join(f"{next(o.path.name for o in inside if o.kind == k)} ({k})" for k in kinds)
+        raise InputError(f"{path}: holds recordings of several kinds, {examples}; give those that are meant by name.")
+    if inside:
+        return inside
+    from rigcal.sources.unknown import RECORDING_SUFFIXES, empty_folder, unknown_file
+
+    for child in _considered(path):
+        if child.suffix.lower() in RECORDING_SUFFIXES and child.is_file():
+            raise unknown_file(child, _head(child))
+    raise empty_folder(path)
 
 
-class _Joined:
-    """Several recordings as one; implements aruco.model.Recording."""
+def _considered(path: Path) -> Iterator[Path]:
+    for child in sorted(path.iterdir()):
+        if child.suffix.lower() not in (*NEVER_RECORDINGS, UNFINISHED_SUFFIX) and not child.name.startswith("."):
+            yield child
 
-    def __init__(self, opened: Sequence[tuple[Path, Recording]]) -> None:
-        self._owners: dict[str, Recording] = {}
-        places: dict[str, Path] = {}
-        for path, recording in opened:
-            for camera in recording.cameras:
-                if camera.name in places:
-                    raise InputError(
-                        f"camera {camera.name} is in {places[camera.name]} and in {path}; rename the camera's folder "
-                        "in one of them, or leave one out."
-                    )
-                places[camera.name] = path
-                self._owners[camera.name] = recording
-        cameras = [camera for _, recording in opened for camera in recording.cameras]
-        self._cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
 
-    @property
-    def cameras(self) -> tuple[Camera, ...]:
-        """The cameras of all recordings, sorted by name."""
-        return self._cameras
+def _children(path: Path) -> Iterator[_Found]:
+    for child in _considered(path):
+        one = _folder(child) if child.is_dir() else _file(child) if child.is_file() else None
+        if one is not None:
+            yield one
 
-    def stamps_ns(self, camera: str) -> NDArray[np.int64]:
-        """The sorted time stamps of a camera's frames."""
-        return self._owner(camera).stamps_ns(camera)
 
-    def depth_indices(self, camera: str) -> NDArray[np.int64]:
-        """Ascending indices of the camera's frames that have depth."""
-        return self._owner(camera).depth_indices(camera)
+def _folder(path: Path) -> _Found | None:
+    from rigcal.sources import rgbd_folder
 
-    def frames(self, camera: str, indices: Sequence[int], *, depth: bool = False) -> Iterator[Frame | BadFrame]:
-        """A camera's frames at ascending indices into its stamps, one at a time."""
-        return self._owner(camera).frames(camera, indices, depth=depth)
+    if rgbd_folder.is_rgbd_folder(path):
+        return _Found(path, "RGB-D folder", _RgbdFolders())
+    from rigcal.sources import ros_bag
 
-    def _owner(self, camera: str) -> Recording:
-        if camera not in self._owners:
-            raise InputError(f"no camera {camera} in the recordings; they have {', '.join(sorted(self._owners))}.")
-        return self._owners[camera]
+    return _Found(path, "ROS bag", ros_bag) if ros_bag.recognises(path, b"") else None
+
+
+class _RgbdFolders:
+    """The reader of RGB-D folders in the shape of the others."""
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        from rigcal.sources.rgbd_folder import is_rgbd_folder
+
+        return is_rgbd_folder(path)
+
+    def opened(self, path: Path, options: SourceOptions) -> Recording:
+        from rigcal.sources.rgbd_folder import RgbdFolder
+
+        return RgbdFolder(path)
+
+
+def _file(path: Path) -> _Found | None:
+    """The first reader that knows what the file holds, if one does."""
+    head = _head(path)
+    for kind, reader in _file_readers():
+        if reader.recognises(path, head):
+            return _Found(path, kind, reader)
+    return None
+
+
+def _file_readers() -> Iterator[tuple[str, _Reader]]:
+    """Readers of files, each imported when those before it do not know the file."""
+    from rigcal.sources import svo2
+
+    yield "ZED", svo2
+    from rigcal.sources import mcap_file
+
+    yield "MCAP", mcap_file
+    from rigcal.sources import ros_bag
+
+    yield "ROS bag", ros_bag
+    from rigcal.sources import zed_sdk
+
+    yield "ZED", zed_sdk
+    from rigcal.sources import video
+
+    yield "video", video
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(HEAD_BYTES)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); mend its permissions.") from error

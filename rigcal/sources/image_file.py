@@ -184,8 +184,8 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
         if marker in _JPEG_FRAMES and at + 9 <= len(data):
             height, width = struct.unpack_from(">HH", data, at + 5)
             size = (width, height)
-        # After the start of scan FF D9 occurs only as the end of the image.
-        if marker == 0xDA and size is not None and data.find(b"\xff\xd9", at) >= 0:
+        # After the start of scan FF D9 occurs only as the end of the image; it is looked for where it should be.
+        if marker == 0xDA and size is not None and data.rfind(b"\xff\xd9", at) >= 0:
             return size
         if marker in (0xDA, 0xD9):
             break

@@ -1,4 +1,4 @@
-"""Writing a recording as an RGB-D folder, whole or not at all.
+"""Writing a recording as an RGB-D folder, whole or not at all; or frame by frame, for those who go on later.
 
 Owns      the order of writing, and what happens when it is interrupted.
 Leaves    the layout to rgbd_folder's description, bytes to camera_info and image_file.
@@ -9,17 +9,23 @@ last: until then the folder does not read as a recording.
 
 from __future__ import annotations
 
+import io
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 from loguru import logger
+from numpy.typing import NDArray
 
 from aruco.errors import OutputError
 from aruco.model import SILENT, BadFrame, Camera, Frame, Progress, Recording
 from rigcal.sources.camera_info import FILE_NAME, dump_camera_info
 from rigcal.sources.image_file import encode_depth, encode_png
+
+# Of a file that is being written.
+_HALF = ".half"
 
 
 def write_recording(recording: Recording, out: Path, *, depth: bool, progress: Progress = SILENT) -> None:
@@ -35,7 +41,7 @@ def write_recording(recording: Recording, out: Path, *, depth: bool, progress: P
         OutputError: The folder holds something or cannot be written.
     """
     for camera in recording.cameras:
-        _refuse_unusable_name(camera.name)
+        refuse_unusable_name(camera.name)
     total = sum(len(recording.stamps_ns(camera.name)) for camera in recording.cameras)
     done = 0
     with _appearing_whole(out) as part:
@@ -63,7 +69,76 @@ def _write_frame(folder: Path, camera: Camera, frame: Frame, depth: bool) -> Non
         (folder / "confidence" / name).write_bytes(encode_png(frame.confidence))
 
 
-def _refuse_unusable_name(name: str) -> None:
+class RgbdFrames:
+    """Frames in a folder that grows, and that a later run can go on with.
+
+    Nothing is lost: depth that 16-bit multiples of the camera's depth_scale do not hold is written as float32.
+    """
+
+    def __init__(self, folder: Path, cameras: Sequence[Camera]) -> None:
+        """Begin the folder, or go on with it."""
+        self._folder = folder
+        self._cameras = {camera.name: camera for camera in cameras}
+        for name in self._cameras:
+            refuse_unusable_name(name)
+            (folder / name / "image").mkdir(parents=True, exist_ok=True)
+
+    def finished(self, camera: str) -> NDArray[np.int64]:
+        """The stamps of a camera's frames that are there."""
+        stamps = [int(path.stem) for path in (self._folder / camera / "image").glob("*.png")]
+        return np.array(sorted(stamps), dtype=np.int64)
+
+    def write(self, frame: Frame) -> None:
+        """Add a frame, its image last: with it the frame is whole."""
+        folder, scale = self._folder / frame.camera, self._cameras[frame.camera].depth_scale
+        if frame.depth_m is not None:
+            fits = fits_steps(frame.depth_m, scale)
+            data = encode_depth(frame.depth_m, scale) if fits else _npy(frame.depth_m)
+            _write_at_once(folder / "depth" / f"{frame.stamp_ns}.{'png' if fits else 'npy'}", data)
+        if frame.confidence is not None:
+            _write_at_once(folder / "confidence" / f"{frame.stamp_ns}.png", encode_png(frame.confidence))
+        _write_at_once(folder / "image" / f"{frame.stamp_ns}.png", encode_png(frame.image))
+
+    def finish(self) -> None:
+        """Make the folder a recording."""
+        for left in self._folder.glob(f"*/*/*{_HALF}"):
+            left.unlink()
+        for name, camera in self._cameras.items():
+            _write_at_once(self._folder / name / FILE_NAME, dump_camera_info(camera).encode())
+
+    def close(self) -> None:
+        """Leave the folder as it is, to be gone on with."""
+
+
+def fits_steps(depth_m: NDArray[np.float32], step_m: float) -> bool:
+    """Whether 16-bit multiples of a step hold a depth image, but for the rounding of its float32 numbers."""
+    measured = depth_m[np.isfinite(depth_m)].astype(np.float64)
+    units = np.rint(measured / step_m)
+    # Those who made the numbers multiplied in float32 or in float64.
+    near = np.abs(units * step_m - measured) <= 2.0**-22 * measured
+    return bool((near & (units >= 1) & (units <= 65535)).all())
+
+
+def _npy(depth_m: NDArray[np.float32]) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, depth_m.astype(np.float32), allow_pickle=False)
+    return stream.getvalue()
+
+
+def _write_at_once(path: Path, data: bytes) -> None:
+    """A file that is never there in part, whenever the process ends."""
+    path.parent.mkdir(exist_ok=True)
+    half = path.with_name(path.name + _HALF)
+    half.write_bytes(data)
+    half.replace(path)
+
+
+def refuse_unusable_name(name: str) -> None:
+    """Refuse a camera's name that would lead elsewhere as a folder's.
+
+    Raises:
+        OutputError: It is empty, holds a separator or leads upwards.
+    """
     if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
         raise OutputError(f"camera {name!r}: a folder cannot have this name; rename the camera.")
 

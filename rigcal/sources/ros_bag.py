@@ -1,0 +1,219 @@
+"""ROS bags: ROS 1 files (.bag) and rosbag2 folders (SQLite or MCAP files), also split ones.
+
+Owns      recognising them, metadata.yaml, and which files are one recording.
+Leaves    the containers to rosbag1_index, rosbag2_sqlite and mcap_file, what messages mean to ros_opening.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any
+
+import yaml
+from loguru import logger
+
+from aruco.errors import InputError
+from aruco.model import Recording
+from rigcal.sources.message_store import Head, MessageStore, SplitStore, Topic, ZstdMessages, plain_type, span_of
+from rigcal.sources.options import SourceOptions
+from rigcal.sources.rosbag1_index import MAGIC, Connection, Rosbag1Index
+from rigcal.sources.rosbag2_sqlite import SIGNATURE, SqliteStore
+
+if TYPE_CHECKING:
+    from rigcal.sources.mcap_file import McapStore
+
+METADATA = "metadata.yaml"
+# A line for each of some thousand files, and some lines for each of some hundred topics.
+MAX_METADATA_BYTES = 4 * 2**20
+# Messages that wait to be written when a file is full come into the next.
+OVERLAP_NS = 1_000_000_000
+# Files of a split bag: <name>_0.db3, <name>_1.db3, ...
+_SPLIT = re.compile(r"(.*)_(\d{1,9})\.(db3|mcap|bag)")
+
+
+def recognises(path: Path, head: bytes) -> bool:
+    """Whether a file is a bag, or a folder holds one bag."""
+    if head:
+        # Any version: what is too old is named when it is opened. Of SQLite files those with rosbag2's table.
+        return head.startswith(b"#ROSBAG V") or (head.startswith(SIGNATURE) and b"TABLE topics" in head)
+    try:
+        return path.is_dir() and bool(_metadata(path).files or _files(path))
+    except (OSError, InputError):
+        # What is wrong with a metadata.yaml is said when it is opened.
+        return (path / METADATA).is_file()
+
+
+def opened(path: Path, options: SourceOptions) -> Recording:
+    """The recording in a bag or a folder.
+
+    Raises:
+        InputError: It cannot be used.
+        MissingExtraError: A package that its compression needs is not installed.
+    """
+    from rigcal.sources.ros_opening import ros_recording
+
+    try:
+        return ros_recording(_store(path), options)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); mend its permissions.") from error
+
+
+class BagStore:
+    """The messages of a ROS 1 bag by topic; implements MessageStore."""
+
+    def __init__(self, path: Path) -> None:
+        """Index the bag; raises InputError."""
+        self.path = path
+        self._index = Rosbag1Index(path)
+        if self._index.loss is not None:
+            logger.warning("{}: {}", path, self._index.loss)
+        groups: dict[str, list[Connection]] = {}
+        for connection in self._index.connections:
+            groups.setdefault(connection.topic, []).append(connection)
+        self._ids: dict[str, list[int]] = {}
+        self._firsts: dict[int, int] = {}  # number of a connection's first message among its topic's
+        self.topics: dict[str, Topic] = {}
+        for name, group in groups.items():
+            alike = [connection for connection in group if connection.type == group[0].type]
+            count = 0
+            for connection in alike:
+                self._firsts[connection.id] = count
+                count += len(self._index.log_times_ns(connection.id))
+            self._ids[name] = [connection.id for connection in alike]
+            self.topics[name] = Topic(name=name, type=plain_type(group[0].type), encoding="ros1", count=count)
+
+    def message(self, topic: str, index: int) -> bytes:
+        """A message's bytes; raises DamagedError where they are lost."""
+        connection = [key for key in self._ids[topic] if self._firsts[key] <= index][-1]
+        return self._index.message(connection, index - self._firsts[connection])
+
+    def heads(self, topics: Sequence[str], size: int) -> Iterator[Head]:
+        """The first bytes of every message of some topics."""
+        names = {key: topic for topic in topics for key in self._ids[topic]}
+        times = {key: self._index.log_times_ns(key) for key in names}
+        for part in self._index.parts(list(names), size):
+            yield Head(
+                topic=names[part.channel],
+                index=self._firsts[part.channel] + part.index,
+                log_time_ns=int(times[part.channel][part.index]),
+                data=part.data,
+            )
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """When the first and the last message were logged; None without messages."""
+        return span_of([self._index.log_times_ns(connection) for connection in self._firsts])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Metadata:
+    """What metadata.yaml says."""
+
+    files: tuple[str, ...] = ()
+    compression_mode: str = ""  # "", "file" or "message"
+    compression_format: str = ""
+
+
+def _store(path: Path) -> MessageStore:
+    if not path.is_dir():
+        return _file_store(path)
+    metadata = _metadata(path)
+    files = _files(path)
+    if not files:
+        raise InputError(f"{path}: no bag there; a rosbag2 folder has {METADATA} and .db3 or .mcap files.")
+    if metadata.compression_mode == "file" or any(name.suffix == ".zstd" for name in files):
+        names = ", ".join(name.name for name in files)
+        raise InputError(
+            f"{path}: its files are compressed whole ({names}); undo that with zstd -d, or convert the bag with "
+            "ros2 bag convert to compression_mode none."
+        )
+    if metadata.compression_mode == "message" and metadata.compression_format != "zstd":
+        raise InputError(f"{path}: its messages are compressed as {metadata.compression_format}, only zstd is read.")
+    stores = [_file_store(name) for name in files]
+    whole = SplitStore(path, stores) if len(stores) > 1 else stores[0]
+    return ZstdMessages(whole) if metadata.compression_mode == "message" else whole
+
+
+def _file_store(path: Path) -> BagStore | SqliteStore | McapStore:
+    with path.open("rb") as stream:
+        head = stream.read(64)
+    if head.startswith(MAGIC):
+        return BagStore(path)
+    if head.startswith(SIGNATURE):
+        return SqliteStore(path)
+    if head.startswith(b"#ROSBAG V"):
+        version = head.split(b"\n")[0][len(b"#ROSBAG V") :].decode("ascii", "replace")
+        raise InputError(f"{path}: is a bag of version {version}, only 2.0 is read; convert it with rosbag fix.")
+    from rigcal.sources.mcap_file import McapStore
+
+    return McapStore(path)  # says what is wrong if it is none either
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of the one bag in a folder, in order; none where there is no bag or several.
+
+    An interrupted recorder has written no metadata.yaml; then the files are known by their numbered names.
+    """
+    metadata = _metadata(path)
+    if metadata.files:
+        # Only names: a bag's files lie beside its metadata, whatever the paths say.
+        found = [path / PurePath(name).name for name in metadata.files]
+        there = [name for name in found if name.is_file()]
+        if len(there) < len(found):
+            missing = ", ".join(name.name for name in found if name not in there)
+            logger.warning("{}: {} of its files are missing: {}", path, len(found) - len(there), missing)
+        return there
+    numbered: dict[tuple[str, str], list[tuple[int, Path]]] = {}
+    for child in path.iterdir():
+        match = _SPLIT.fullmatch(child.name)
+        if match is not None and child.is_file():
+            numbered.setdefault((match[1], match[3]), []).append((int(match[2]), child))
+    # One file alone is a recording without its folder.
+    if len(numbered) != 1 or len(next(iter(numbered.values()))) < 2:
+        return []
+    files = [child for _, child in sorted(next(iter(numbered.values())))]
+    return files if _are_split(files) else []
+
+
+def _are_split(files: Sequence[Path]) -> bool:
+    """Whether files are one after the other. RealSense's are one a camera, whatever they are called."""
+    from rigcal.sources.realsense_topics import is_realsense
+
+    stores = [_file_store(path) for path in files]
+    if any(is_realsense(store.topics) for store in stores):
+        return False
+    spans = [span for store in stores if (span := store.span_ns()) is not None]
+    overlap_ns = min([OVERLAP_NS, *((end - start) // 2 for start, end in spans)])
+    return all(later[0] >= earlier[1] - overlap_ns for earlier, later in pairwise(spans))
+
+
+def _metadata(path: Path) -> _Metadata:
+    file = path / METADATA
+    if not file.is_file():
+        return _Metadata()
+    if file.stat().st_size > MAX_METADATA_BYTES:
+        raise InputError(f"{file}: over {MAX_METADATA_BYTES >> 20} MiB, which is not a rosbag2 description.")
+    try:
+        # The base loader makes texts, lists and maps only.
+        content = yaml.load(file.read_text(encoding="utf-8-sig"), Loader=yaml.BaseLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{file}: not a readable YAML file ({reason}); restore it or run ros2 bag reindex.") from error
+    bag = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
+    if not isinstance(bag, dict):
+        return _Metadata()  # another program's
+    return _Metadata(
+        files=tuple(
+            name for name in _list(bag, "relative_file_paths") if isinstance(name, str) and PurePath(name).name
+        ),
+        compression_mode=str(bag.get("compression_mode", "")).lower().replace("none", ""),
+        compression_format=str(bag.get("compression_format", "")).lower(),
+    )
+
+
+def _list(content: Mapping[str, Any], key: str) -> list[Any]:
+    value = content.get(key)
+    return value if isinstance(value, list) else []

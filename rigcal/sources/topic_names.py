@@ -1,0 +1,76 @@
+"""What the names of ROS image topics tell: streams, namespaces, ways of transport.
+
+Owns      the words that drivers use (RealSense, ZED, Azure Kinect, Orbbec, image_transport, image_proc, usb_cam).
+Leaves    choosing among topics to ros_topics.
+"""
+
+from __future__ import annotations
+
+import re
+
+from rigcal.sources.message_store import Topic
+from rigcal.sources.ros_images import is_depth
+
+IMAGE, COMPRESSED, INFO = "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo"
+
+# Last parts of the names of topics that image_transport makes of one.
+TRANSPORTS = ("compressed", "compressedDepth", "zstd", "theora")
+# Streams in the order in which they are taken; None: the namespace is the camera's itself.
+STREAMS = (
+    ("colour", r"rgb|colou?r|rgb_raw|colou?r_raw|rgb_to_depth|colou?r_to_depth"),
+    ("left", r"left|left_raw|left_rect"),
+    ("", None),
+    ("grey", r"mono|gr[ae]y|(left|rgb)_gr[ae]y"),
+    ("infrared", r"ir|infra|infra1|infrared|infrared1|(left|ir)_(ir|left)|fisheye1?"),
+    ("right", r"right|right_(raw|rect|gr[ae]y)|infra2|infrared2|(right|ir)_(ir|right)|fisheye2"),
+)
+_DEPTH = re.compile(
+    r"depth|depth_(to_\w+|registered|raw|rect|rect_raw|image)|aligned_depth(_to_\w+)?|[sh]w_registered|"
+    r"confidence(_map)?|disparity(_image)?",
+    re.IGNORECASE,
+)
+# What is stored like depth beside it.
+NO_DEPTH = re.compile(r"confidence|disparity|cost", re.IGNORECASE)
+GREY = re.compile(r"gr[ae]y|mono", re.IGNORECASE)
+
+
+def base_of(topic: Topic) -> str:
+    """The name of an image topic without the way of its transport."""
+    head, _, last = topic.name.rpartition("/")
+    return head if topic.type == COMPRESSED and last in TRANSPORTS and head else topic.name
+
+
+def is_rectified(base: str) -> bool:
+    """Whether a name says that its images are rectified."""
+    return any(part == "rect" or part.startswith("image_rect") or part.endswith("_rect") for part in base.split("/"))
+
+
+def namespace_of(base: str) -> tuple[str, int]:
+    """(the camera's namespace, index of the stream in STREAMS) of an image topic."""
+    parts = base.strip("/").split("/")
+    for at, part in enumerate(parts):
+        for kind, (_, pattern) in enumerate(STREAMS):
+            if pattern is not None and re.fullmatch(pattern, part, re.IGNORECASE):
+                return "/".join(parts[:at]), kind
+        if _DEPTH.fullmatch(part):
+            return "/".join(parts[:at]), len(STREAMS)
+    return "/".join(parts[:-1]), next(kind for kind, (_, pattern) in enumerate(STREAMS) if pattern is None)
+
+
+def is_depth_topic(base: str, encoding: str) -> bool:
+    """Depth or what goes with it; a name alone is not enough: simulators call a colour camera depth_camera."""
+    named = any(_DEPTH.fullmatch(part) for part in base.split("/"))
+    return is_depth(encoding) or (named and encoding.lower() in ("mono16", "mono8", "8uc1", "32fc1"))
+
+
+def camera_name(namespace: str) -> str:
+    """A namespace as a name: camera of /camera/camera, zed of /zed/zed_node; empty for none."""
+    parts = [part for part in namespace.split("/") if part]
+    kept = [part for k, part in enumerate(parts) if part not in parts[:k] and (part != "zed_node" or k == 0)]
+    return "_".join(kept).strip("_")
+
+
+def side_of(kind: int) -> str:
+    """left, right, or empty for neither, of an index into STREAMS."""
+    name = STREAMS[kind][0] if kind < len(STREAMS) else ""
+    return name if name in ("left", "right") else ""
