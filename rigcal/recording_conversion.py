@@ -1,18 +1,18 @@
 """Any recording to an RGB-D folder or an MCAP file: frame by frame, and what is finished is never lost.
 
-Owns      which frames are converted, going on after an interruption, making the result appear whole.
-Leaves    reading to rigcal.sources, writing to rgbd_writer and mcap_writer there.
+Owns      which frames are converted, in which order, making the result appear whole.
+Leaves    reading to rigcal.sources, writing to rgbd_writer and mcap_writer there, knowing an interrupted conversion
+          again to conversion_state.
 
-Frames are kept in ``<out>.part``, a folder, until all are there; a state file in it says what is being converted.
+Frames are kept in ``<out>.part``, a folder, until all are there.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,13 +21,13 @@ import numpy as np
 from loguru import logger
 from numpy.typing import NDArray
 
-from aruco.atomic import write_whole
 from aruco.errors import InputError, OutputError
-from aruco.model import SILENT, BadFrame, Camera, Frame, KnowsUp, Progress, Recording
+from aruco.model import SILENT, BadFrame, Frame, KnowsUp, Progress, Recording
 from aruco.svo_sync import sample, synchronise
+from rigcal.config import Resources
+from rigcal.conversion_state import Indices, held, state_of
 from rigcal.recordings import plain_options
 from rigcal.sources import STATE_FILE, UNFINISHED_SUFFIX, open_recordings
-from rigcal.sources.camera_info import dump_camera_info
 from rigcal.sources.mcap_writer import McapFrames
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.rgbd_writer import RgbdFrames, refuse_unusable_name
@@ -37,8 +37,8 @@ MCAP_SUFFIX = ".mcap"
 GROWING_FILE = "frames"
 # Every bad frame after these is counted only.
 SPOKEN_BAD_FRAMES = 5
-
-Indices = Mapping[str, NDArray[np.int64]]  # camera -> ascending indices of frames
+# Frames that are packed at once: more take memory, and reading is slower by then.
+MAX_AHEAD = 8
 
 
 class _Frames(Protocol):
@@ -46,7 +46,9 @@ class _Frames(Protocol):
 
     def finished(self, camera: str) -> NDArray[np.int64]: ...
 
-    def write(self, frame: Frame) -> None: ...
+    def packed(self, frame: Frame) -> Any: ...
+
+    def store(self, packed: Any) -> None: ...
 
     def finish(self) -> None: ...
 
@@ -102,14 +104,15 @@ def convert_recording(
     recording = open_recordings(paths, options)
     depth = _wants_depth(recording, depth)
     wanted = _wanted(recording, every)
-    part = out.with_name(out.name + UNFINISHED_SUFFIX)
-    state = _state(recording, wanted, _options_that_matter(options, out, depth, every))
+    goal = out.resolve()
+    part = goal.with_name(goal.name + UNFINISHED_SUFFIX)
+    state = state_of(recording, wanted, _options_that_matter(options, out, depth, every))
     _tell_what_is_left_behind(recording)
     try:
-        with _held(part, state):
+        with held(part, state):
             frames = _frames(recording, part, out, depth)
             converted = _convert(recording, wanted, frames, depth, progress, part)
-            _appear(part, out)
+            _appear(part, goal)
     except OSError as error:
         raise OutputError(
             f"{out}: cannot be written ({error.strerror or error}); make room or choose another place (finished frames "
@@ -157,104 +160,12 @@ def _tell_what_is_left_behind(recording: Recording) -> None:
         logger.warning("which way is up, as the cameras measured it, is not converted: keep the recording itself")
 
 
-# State
-
-
 def _options_that_matter(options: SourceOptions, out: Path, depth: bool, every: int) -> dict[str, Any]:
     return {
         "to": "mcap" if out.suffix.lower() == MCAP_SUFFIX else "rgbd",
         "every": every,
         "depth": {"mode": options.depth_mode, "stereo": options.stereo_depth} if depth else None,
     }
-
-
-def _state(recording: Recording, wanted: Indices, options: Mapping[str, Any]) -> dict[str, Any]:
-    """What tells one conversion from another."""
-    cameras = {camera.name: _fingerprint(recording, camera, wanted[camera.name]) for camera in recording.cameras}
-    return {"format": "rigcal.conversion", "version": 1, "options": dict(options), "cameras": cameras}
-
-
-def _fingerprint(recording: Recording, camera: Camera, indices: NDArray[np.int64]) -> dict[str, Any]:
-    stamps = recording.stamps_ns(camera.name)
-    return {
-        "camera_info": hashlib.sha256(dump_camera_info(camera).encode()).hexdigest(),
-        "frames": len(indices),
-        "stamps": hashlib.sha256(stamps[indices].astype("<i8").tobytes()).hexdigest(),
-        "first": _digest(next(iter(recording.frames(camera.name, indices[:1].tolist())), None)),
-    }
-
-
-def _digest(frame: Frame | BadFrame | None) -> str:
-    if not isinstance(frame, Frame):
-        return ""
-    return frame.digest or hashlib.sha256(frame.image.tobytes()).hexdigest()
-
-
-@contextmanager
-def _held(part: Path, state: Mapping[str, Any]) -> Iterator[None]:
-    """The folder of unfinished frames, for this run alone."""
-    known = _known_state(part)
-    if known is not None and known != state:
-        raise OutputError(
-            f"{part}: is left from converting something else ({_difference(known, state)}); give the same recordings "
-            "and options to go on, remove it, or choose another name."
-        )
-    part.mkdir(parents=True, exist_ok=True)
-    if known is None:
-        write_whole(part / STATE_FILE, json.dumps(state, indent=1).encode())
-    with _locked(part):
-        yield
-
-
-def _known_state(part: Path) -> Mapping[str, Any] | None:
-    """The state of an earlier run, None where there is none."""
-    if not part.exists():
-        return None
-    try:
-        left = {path.name for path in part.iterdir()}
-        if left <= {STATE_FILE + ".part"}:  # killed before anything was begun
-            return None
-        found = json.loads((part / STATE_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise OutputError(
-            f"{part}: is there already and is no unfinished conversion; remove it, or choose another name."
-        ) from error
-    return found if isinstance(found, dict) else {}
-
-
-def _difference(known: Mapping[str, Any], state: Mapping[str, Any]) -> str:
-    """The first thing in words that two states differ in."""
-    for key, value in state["options"].items():
-        if (known.get("options") or {}).get(key) != value:
-            return f"--{key}" if key != "to" else "another kind of result"
-    before, now = known.get("cameras") or {}, state["cameras"]
-    if before.keys() != now.keys():
-        return f"its cameras are {', '.join(sorted(before)) or 'none'}, not {', '.join(sorted(now))}"
-    words = {"camera_info": "other intrinsics", "frames": "another number of frames", "stamps": "other time stamps"}
-    for name, about in now.items():
-        for key, value in about.items():
-            if before[name].get(key) != value:
-                return f"camera {name} has {words.get(key, 'other images')}"
-    return "by another version of this program"
-
-
-@contextmanager
-def _locked(part: Path) -> Iterator[None]:
-    """Keep a second run out; the lock goes with the process, however that ends."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        yield
-        return
-    with (part / STATE_FILE).open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise OutputError(f"{part}: another run is writing it; wait for that, or choose another name.") from error
-        yield
-
-
-# Frames
 
 
 def _frames(recording: Recording, part: Path, out: Path, depth: bool) -> _Frames:
@@ -278,12 +189,12 @@ def _convert(
         logger.info("{}: an earlier run finished {} of {} frames; going on from there", part, kept, total)
     bad = done = 0
     try:
-        for frame in _by_time(recording, missing, depth):
-            if isinstance(frame, BadFrame):
+        for packed in _packed(_by_time(recording, missing, depth), frames):
+            if isinstance(packed, BadFrame):
                 bad += 1
-                _tell_bad(frame, bad)
+                _tell_bad(packed, bad)
             else:
-                frames.write(frame)
+                frames.store(packed)
             done += 1
             progress.step("convert", kept + done, total)
         frames.finish()
@@ -309,6 +220,26 @@ def _by_time(recording: Recording, wanted: Indices, depth: bool) -> Iterator[Fra
     owners = np.repeat(np.arange(len(names)), [len(wanted[name]) for name in names])
     for k in np.argsort(stamps, kind="stable").tolist():
         yield next(streams[names[owners[k]]])
+
+
+def _packed(frames: Iterator[Frame | BadFrame], to: _Frames) -> Iterator[Any]:
+    """Frames as they will be stored, or BadFrame, in the same order; some are packed while others are read."""
+    jobs = min(Resources().jobs, MAX_AHEAD)
+    with ThreadPoolExecutor(jobs) as pool:
+        waiting: deque[BadFrame | Future[Any]] = deque()
+        try:
+            for frame in frames:
+                waiting.append(frame if isinstance(frame, BadFrame) else pool.submit(to.packed, frame))
+                if len(waiting) > jobs:
+                    yield _done(waiting.popleft())
+            while waiting:
+                yield _done(waiting.popleft())
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _done(waiting: BadFrame | Future[Any]) -> Any:
+    return waiting if isinstance(waiting, BadFrame) else waiting.result()
 
 
 def _tell_bad(frame: BadFrame, count: int) -> None:

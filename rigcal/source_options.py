@@ -29,8 +29,8 @@ _OPTIONS = (
     click.option("--same-clock", is_flag=True,
                  help="Videos without time stamps beside them began at the same moment."),
     click.option("--intrinsics", type=click.Path(path_type=Path), metavar="FILE",
-                 help="Intrinsics of the cameras of videos: camera_info, OpenCV or Kalibr YAML, aniposelib TOML. "
-                      "Default: looked for beside the videos."),
+                 help="Intrinsics of the cameras of videos, or of bags without camera info: camera_info, OpenCV or "
+                      "Kalibr YAML, aniposelib TOML. Default: looked for beside the videos."),
 )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from aruco.model import BadFrame, Camera, Frame
 from rigcal import recording_conversion
 from rigcal.recording_conversion import Converted, convert_recording
 from rigcal.sources import open_recordings
-from rigcal.sources.mcap_growing import ChunkMessage, GrowingMcap
+from rigcal.sources.mcap_growing import ChunkMessage, GrowingMcap, packed_chunk
 from rigcal.sources.mcap_writer import namespaces
 from rigcal.sources.rgbd_folder import RgbdFolder
 from rigcal.sources.rgbd_writer import fits_steps
@@ -440,7 +440,7 @@ def test_a_file_that_begins_otherwise_is_not_gone_on_with(tmp_path: Path) -> Non
         return Channel(id=1, topic=topic, message_encoding="", schema_id=0, metadata={})
 
     file = GrowingMcap(tmp_path / "one", [], [channel("/a")], frozenset({1}))
-    file.add([ChunkMessage(1, 5, b"data")], compressed=False)
+    file.add(packed_chunk([ChunkMessage(1, 5, b"data")], compressed=False))
     file.close()
     with pytest.raises(OutputError, match="does not begin as this conversion would"):
         GrowingMcap(tmp_path / "one", [], [channel("/b")], frozenset({1}))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, NamedTuple
 
@@ -33,6 +33,41 @@ class ChunkMessage(NamedTuple):
     channel: int
     log_time_ns: int
     data: bytes
+
+
+class PackedChunk(NamedTuple):
+    """A chunk as it will stand in the file."""
+
+    record: bytes
+    indexes: dict[int, bytes]  # channel -> message index
+    times: bytes
+    compression: str
+    stored: int
+
+
+def packed_chunk(messages: Sequence[ChunkMessage], *, compressed: bool) -> PackedChunk:
+    """A chunk of messages of different channels; a file's chunks end with a message of one of its last channels."""
+    from mcap.records import Chunk, Message, MessageIndex
+
+    records = bytearray()
+    indexes: dict[int, bytes] = {}
+    for channel, log_time_ns, data in messages:
+        indexes[channel] = _written(MessageIndex(channel, [(log_time_ns, len(records))]))
+        records += _written(Message(channel, log_time_ns, data, log_time_ns, sequence=0))
+    times = [message.log_time_ns for message in messages]
+    compression = "zstd" if compressed else ""
+    stored = _zstandard(records) if compressed else bytes(records)
+    record = _written(
+        Chunk(
+            compression=compression,
+            data=stored,
+            message_start_time=min(times),
+            message_end_time=max(times),
+            uncompressed_crc=zlib.crc32(records),
+            uncompressed_size=len(records),
+        )
+    )
+    return PackedChunk(record, indexes, record[_RECORD.size :][: _TIMES.size], compression, len(stored))
 
 
 class GrowingMcap:
@@ -72,33 +107,13 @@ class GrowingMcap:
         self._file.truncate(self._end)
         self._file.seek(self._end)
 
-    def add(self, messages: Sequence[ChunkMessage], *, compressed: bool) -> None:
-        """Write messages as one chunk; the last of them is of one of the last channels."""
-        from mcap.records import Chunk, Message, MessageIndex
-
-        offsets: dict[int, int] = {}
-        records = bytearray()
-        for channel, log_time_ns, data in messages:
-            offsets[channel] = len(records)
-            records += _written(Message(channel, log_time_ns, data, log_time_ns, self._counts[channel]))
-            self._counts[channel] += 1
-        times = [message.log_time_ns for message in messages]
-        stored = _zstandard(records) if compressed else bytes(records)
-        chunk = _written(
-            Chunk(
-                compression="zstd" if compressed else "",
-                data=stored,
-                message_start_time=min(times),
-                message_end_time=max(times),
-                uncompressed_crc=zlib.crc32(records),
-                uncompressed_size=len(records),
-            )
-        )
-        indexes = [_written(MessageIndex(channel, [(time, offsets[channel])])) for channel, time, _ in messages]
-        self._file.write(chunk + b"".join(indexes))
+    def add(self, chunk: PackedChunk) -> None:
+        """Write a chunk, in one piece."""
+        self._file.write(chunk.record + b"".join(chunk.indexes.values()))
         self._file.flush()
-        lengths = {channel: len(index) for (channel, _, _), index in zip(messages, indexes)}
-        self._note(len(chunk), chunk[_RECORD.size :][: _TIMES.size], "zstd" if compressed else "", len(stored), lengths)
+        self._counts.update(chunk.indexes.keys())
+        lengths = {channel: len(index) for channel, index in chunk.indexes.items()}
+        self._note(_Group(len(chunk.record), chunk.times, chunk.compression, chunk.stored, lengths))
 
     def finish(self) -> None:
         """Write the summary and close the file."""
@@ -142,30 +157,30 @@ class GrowingMcap:
         size = self._file.seek(0, 2)
         while (group := _group(self._file, self._end, size)) is not None and group.lengths.keys() & self._last:
             self._counts.update(group.lengths.keys())
-            self._note(group.length, group.times, group.compression, group.stored, group.lengths)
+            self._note(group)
 
-    def _note(self, length: int, times: bytes, compression: str, stored: int, lengths: Mapping[int, int]) -> None:
+    def _note(self, group: _Group) -> None:
         """Keep what the summary says of a chunk; as bytes, since long recordings have many."""
         from mcap.records import ChunkIndex
 
-        start_ns, end_ns, uncompressed = _TIMES.unpack(times)
-        offsets, at = {}, self._end + length
-        for channel, index_length in lengths.items():
+        start_ns, end_ns, uncompressed = _TIMES.unpack(group.times)
+        offsets, at = {}, self._end + group.length
+        for channel, index_length in group.lengths.items():
             offsets[channel] = at
             at += index_length
         index = ChunkIndex(
-            chunk_length=length,
+            chunk_length=group.length,
             chunk_start_offset=self._end,
-            compression=compression,
-            compressed_size=stored,
+            compression=group.compression,
+            compressed_size=group.stored,
             message_end_time=end_ns,
-            message_index_length=at - self._end - length,
+            message_index_length=at - self._end - group.length,
             message_index_offsets=offsets,
             message_start_time=start_ns,
             uncompressed_size=uncompressed,
         )
         self._indexes.append(_written(index))
-        for channel in lengths.keys() & self._last:
+        for channel in group.lengths.keys() & self._last:
             self.log_times_ns[channel].append(end_ns)
         known = self._span or (start_ns, end_ns)
         self._span = (min(known[0], start_ns), max(known[1], end_ns))

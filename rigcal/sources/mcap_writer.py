@@ -29,7 +29,7 @@ from aruco.errors import MissingExtraError, OutputError
 from aruco.model import Camera, Frame
 from aruco.pose_math import Array
 from rigcal.sources.image_file import encode_png
-from rigcal.sources.mcap_growing import ChunkMessage, GrowingMcap
+from rigcal.sources.mcap_growing import ChunkMessage, GrowingMcap, PackedChunk, packed_chunk
 from rigcal.sources.rgbd_writer import fits_steps
 
 NAME_KEY, BASELINE_KEY = "rigcal.camera", "rigcal.baseline_m"
@@ -74,8 +74,8 @@ class McapFrames:
         """The stamps of a camera's frames that are there."""
         return np.array(self._file.log_times_ns[self._first[camera]], dtype=np.int64)
 
-    def write(self, frame: Frame) -> None:
-        """Add a frame.
+    def packed(self, frame: Frame) -> PackedChunk:
+        """A frame as it will be stored; may be called from several threads.
 
         Raises:
             OutputError: Its stamp is beyond what such files can hold.
@@ -99,7 +99,11 @@ class McapFrames:
         # The image last: with it the frame is whole.
         parts.append((IMAGE, self._messages.image(head, frame.image)))
         messages = [ChunkMessage(first + kind, frame.stamp_ns, bytes(data)) for kind, data in parts]
-        self._file.add(messages, compressed=len(parts) > 2)  # a PNG does not become smaller
+        return packed_chunk(messages, compressed=len(parts) > 2)  # a PNG does not become smaller
+
+    def store(self, packed: PackedChunk) -> None:
+        """Add a frame."""
+        self._file.add(packed)
 
     def finish(self) -> None:
         """End the file, which is a whole recording then."""

@@ -160,8 +160,8 @@ class _CameraFolder:
         return _CameraFolder(
             camera=load_camera_info(path / FILE_NAME, path.name),
             **files,
-            depth_of=_belonging(files[IMAGE].stamps_ns, files[DEPTH].stamps_ns),
-            confidence_of=_belonging(files[IMAGE].stamps_ns, files[CONFIDENCE].stamps_ns),
+            depth_of=belonging(files[IMAGE].stamps_ns, files[DEPTH].stamps_ns),
+            confidence_of=belonging(files[IMAGE].stamps_ns, files[CONFIDENCE].stamps_ns),
         )
 
     def read(self, index: int, depth: bool) -> Frame | BadFrame:
@@ -203,20 +203,20 @@ def _read_confidence(path: Path, size: tuple[int, ...] | None) -> NDArray[np.uin
     return confidence
 
 
-def _belonging(images_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def belonging(images_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """For each image (n,) the file that belongs to it, -1 for none.
 
     A file belongs to the image whose stamp is nearest, within half a frame period; of several the nearest is taken.
     Where images are seconds apart (stills) the reach is bounded as for synchronising cameras.
     """
-    belonging = np.full(len(images_ns), -1, dtype=np.int64)
+    found = np.full(len(images_ns), -1, dtype=np.int64)
     if not len(images_ns) or not len(others_ns):
-        return belonging
+        return found
     owner = nearest(images_ns, others_ns)
     distance = np.abs(images_ns[owner] - others_ns)
     within = distance <= default_tolerance_ns([images_ns])
     # The last assignment stays: the nearest file, of equals the earlier.
     order = np.lexsort((-others_ns, -distance))
     order = order[within[order]]
-    belonging[owner[order]] = order
-    return belonging
+    found[owner[order]] = order
+    return found

@@ -88,16 +88,23 @@ class RgbdFrames:
         stamps = [int(path.stem) for path in (self._folder / camera / "image").glob("*.png")]
         return np.array(sorted(stamps), dtype=np.int64)
 
-    def write(self, frame: Frame) -> None:
-        """Add a frame, its image last: with it the frame is whole."""
+    def packed(self, frame: Frame) -> list[tuple[Path, bytes]]:
+        """A frame as it will be stored; may be called from several threads."""
         folder, scale = self._folder / frame.camera, self._cameras[frame.camera].depth_scale
+        files: list[tuple[Path, bytes]] = []
         if frame.depth_m is not None:
             fits = fits_steps(frame.depth_m, scale)
             data = encode_depth(frame.depth_m, scale) if fits else _npy(frame.depth_m)
-            _write_at_once(folder / "depth" / f"{frame.stamp_ns}.{'png' if fits else 'npy'}", data)
+            files.append((folder / "depth" / f"{frame.stamp_ns}.{'png' if fits else 'npy'}", data))
         if frame.confidence is not None:
-            _write_at_once(folder / "confidence" / f"{frame.stamp_ns}.png", encode_png(frame.confidence))
-        _write_at_once(folder / "image" / f"{frame.stamp_ns}.png", encode_png(frame.image))
+            files.append((folder / "confidence" / f"{frame.stamp_ns}.png", encode_png(frame.confidence)))
+        # The image last: with it the frame is whole.
+        return [*files, (folder / "image" / f"{frame.stamp_ns}.png", encode_png(frame.image))]
+
+    def store(self, packed: Sequence[tuple[Path, bytes]]) -> None:
+        """Add a frame."""
+        for path, data in packed:
+            _write_at_once(path, data)
 
     def finish(self) -> None:
         """Make the folder a recording."""

@@ -20,7 +20,7 @@ from aruco.lens import bend
 from aruco.model import BadFrame, Camera, Frame
 from rigcal.sources.decompression import DamagedError
 from rigcal.sources.message_store import MessageStore
-from rigcal.sources.rgbd_folder import _belonging as belonging
+from rigcal.sources.rgbd_folder import belonging
 from rigcal.sources.ros_images import confidence_percent, depth_metres, image_pixels
 from rigcal.sources.ros_messages import PackedImage, RawImage, read_compressed, read_image
 from rigcal.sources.topic_names import IMAGE
