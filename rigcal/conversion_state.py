@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -68,7 +69,11 @@ def held(part: Path, state: Mapping[str, Any]) -> Iterator[None]:
         )
     part.mkdir(parents=True, exist_ok=True)
     if known is None:
-        write_whole(part / STATE_FILE, json.dumps(state, indent=1).encode())
+        try:
+            write_whole(part / STATE_FILE, json.dumps(state, indent=1).encode())
+        except BaseException:
+            shutil.rmtree(part, ignore_errors=True)  # nothing but a state is in it
+            raise
     with _locked(part):
         yield
 

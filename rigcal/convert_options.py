@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from rigcal.formats.registry import NAMES
 from rigcal.source_options import source_options
@@ -51,7 +52,7 @@ _OPTIONS = (
     click.option("--into", type=click.Path(path_type=Path), metavar="FILE",
                  help="zed-fusion: take everything but the poses from this configuration."),
     click.option("--every", type=click.IntRange(min=1), metavar="N",
-                 help="Of a recording: every Nth frame of each camera."),
+                 help="Of a recording: every Nth moment that the cameras share."),
     click.option("--depth/--no-depth", default=None,
                  help="Of a recording: with depth, or images only. Default: what it has."),
 )  # fmt: skip
@@ -65,6 +66,13 @@ OF_CALIBRATIONS = {
     "into": "--into",
 }
 OF_RECORDINGS = {"every": "--every", "depth": "--depth or --no-depth"}
+OF_SOURCES = {
+    "depth_mode": "--depth-mode",
+    "zed_conf": "--zed-conf",
+    "stereo_depth": "--stereo-depth",
+    "topics": "--topics",
+    "same_clock": "--same-clock",
+}
 OF_FORMATS = ("parent_frame", "frame_name", "image_name", "into")
 
 
@@ -83,10 +91,12 @@ def use_of(given: Mapping[str, Any]) -> Use:
         click.UsageError: None, or options of two; what to give instead.
     """
     if given["explain"] or given["formats"]:
-        if given["paths"] or given["to"]:
+        if len(_stated() - {"debug"}) > 1:
             raise click.UsageError("--explain and --formats convert nothing; leave out the rest.")
         return "explain" if given["explain"] else "formats"
     if given["to"]:
+        if not given["recordings"] and (odd := [OF_SOURCES[key] for key in OF_SOURCES if key in _stated()]):
+            raise click.UsageError(f"{odd[0]} says how a recording is read; give the recording as --recording with it.")
         _refuse(given, OF_RECORDINGS, "is for recordings, and --to for calibrations; leave one out.")
         if len(given["paths"]) + bool(given["output"]) != 2:
             raise click.UsageError(
@@ -100,6 +110,12 @@ def use_of(given: Mapping[str, Any]) -> Use:
             "RECORDING OUT."
         )
     return "recording"
+
+
+def _stated() -> set[str]:
+    """The parameters that stand on the command line."""
+    context = click.get_current_context()
+    return {key for key in context.params if context.get_parameter_source(key) is ParameterSource.COMMANDLINE}
 
 
 def _refuse(given: Mapping[str, Any], options: Mapping[str, str], why: str) -> None:

@@ -7,7 +7,7 @@ Leaves    formats to rigcal.formats, recordings to rigcal.sources.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +50,8 @@ def export(
         OutputError: The output cannot be written, or is an input.
     """
     intrinsics = source_options.intrinsics if source_options else None
-    _refuse_inputs(out, [calibration, *(path for path in (options.into, intrinsics) if path)])
+    zed_conf = source_options.zed_conf if source_options else None
+    _refuse_inputs(out, [calibration, *filter(None, (options.into, intrinsics, zed_conf))], recordings)
     cli.refuse_inputs(out, recordings, None)
     rig = _read(calibration)
     if intrinsics:
@@ -100,11 +101,48 @@ def _with_cameras(rig: Rig, cameras: Mapping[str, Camera], where: str) -> Rig:
     return replace(rig, cameras={**rig.cameras, **ours})
 
 
-def _refuse_inputs(out: Path, inputs: Sequence[Path]) -> None:
+def _refuse_inputs(out: Path, inputs: Sequence[Path], recordings: Sequence[Path]) -> None:
+    """See that writing touches no input: not with the output, nor with what stands beside it in the meantime.
+
+    Raises:
+        OutputError: It would, or nobody can tell.
+    """
     goal = out.resolve()
-    for path in inputs:
-        source = path.resolve()
-        same = os.path.exists(out) and os.path.exists(path) and os.path.samefile(out, path)
-        # Of a folder that is read no file is replaced, and no folder that what is read lies in.
-        if same or goal == source or source.is_relative_to(goal) or (goal.exists() and goal.is_relative_to(source)):
-            raise OutputError(f"{out}: is an input; choose another name for the output.")
+    # Of the last two, see aruco.atomic and whole_folder: they stand there until the output is whole.
+    touched = [out, goal, Path(f"{goal}.part"), Path(f"{goal}.old")]
+    try:
+        hit = next((path for path in touched if _is_input(path, inputs) or _is_recorded(path, recordings)), None)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be looked at ({error.strerror or error}); choose another place.") from error
+    if hit is not None:
+        name = out if hit in (out, goal) else f"{out}: {hit.name}, which is replaced on the way"
+        raise OutputError(f"{name}: is an input; choose another name for the output.")
+
+
+def _is_input(path: Path, inputs: Sequence[Path]) -> bool:
+    """Whether a path is an input or a link to it, lies in one that is a folder, or is a folder that one lies in."""
+    goal, sources = path.resolve(), [source.resolve() for source in inputs]
+    around = any(source.is_relative_to(goal) for source in sources)
+    inside = goal.exists() and any(goal.is_relative_to(source) for source in sources)
+    return around or inside or _one_of(goal, sources)
+
+
+def _is_recorded(path: Path, recordings: Sequence[Path]) -> bool:
+    """Whether what exists at a path lies in a recording, or beside one that is a file: lenses and time stamps do."""
+    if not path.exists():
+        return False
+    place = path.parent.resolve() / path.name  # a link in a recording is a part of it
+    for recording in recordings:
+        root = recording.resolve()
+        if root.is_relative_to(place) or place.is_relative_to(root):
+            return True
+        folders = [root] if root.is_dir() else [root.parent, recording.parent.resolve()]
+        for folder in filter(Path.is_dir, folders):
+            if (place.parent == folder and place.is_file()) or _one_of(place, folder.iterdir()):
+                return True
+    return False
+
+
+def _one_of(path: Path, others: Iterable[Path]) -> bool:
+    """Whether a path is one of these files by another name."""
+    return path.is_file() and any(other.is_file() and os.path.samefile(path, other) for other in others)

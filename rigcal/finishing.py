@@ -29,7 +29,7 @@ from rigcal.depth_scale import scale_from_depth
 from rigcal.depth_witness import DepthTestimony, hear_depth
 from rigcal.detecting import Seen
 from rigcal.evidence import Evidence
-from rigcal.gravity_witness import GravityTestimony, beside_world, hear_gravity, trusted_up
+from rigcal.gravity_witness import GravityTestimony, beside_world, hear_gravity, require_upright, trusted_up
 from rigcal.kept import KeptRig
 from rigcal.kept_check import NOTHING_COMPARED, KeptCheck
 from rigcal.listeners import NOBODY, Listeners
@@ -166,6 +166,7 @@ def assess(
         kept=check,
         depth_scale=depth,
         up_is_guess=up_is_guess,
+        up_by_imu=config.align.up_from == "imu",
         gravity=gravity,
         target_estimated=config.refine_target,
     )
@@ -197,7 +198,9 @@ def align(
         return np.eye(4), {}
     T_world_cam = {name: placement.T_world_cam for name, placement in rig.cameras.items()}
     if config.up_from == "imu":
-        aligned = alignment.turn_upright(T_world_cam, trusted_up(heard), up_axis=config.up_axis)
+        up_world = trusted_up(heard)
+        require_upright(T_world_cam, up_world)
+        aligned = alignment.turn_upright(T_world_cam, up_world, up_axis=config.up_axis)
         note: dict[str, Any] = {"up_from": "imu", "is_guess": False}
     else:
         decision = _up_of_target(rig, T_world_cam, faces, config, moving=moving, heard=heard)

@@ -22,6 +22,10 @@ from rigcal.config import AlignConfig
 from rigcal.quality.gates import GATES, Reading
 
 TILT, ODD = "up by accelerometers", "cameras whose accelerometer contradicts the others"
+# No target lies so far from level, and no face of a box but the opposite one: beyond it somebody's sign is wrong.
+OPPOSITE_DEG = 150.0
+# Of a camera that looks straight down nobody can say whether it hangs upside down; nearer to that it has no vote.
+STEEP_DEG = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,6 +89,25 @@ def trusted_up(heard: UpByAccelerometers | None) -> Array:
     return heard.up_world
 
 
+def require_upright(T_world_cam: Mapping[str, Pose], up_world: Array) -> None:
+    """See that the accelerometers' up (3,) does not put most cameras upside down: their sign was assumed, not proven.
+
+    A camera's upper side points below the horizon exactly where it is rolled by more than 90 degrees about its axis,
+    whatever its pitch.
+
+    Raises:
+        CalibrationError: It does.
+    """
+    heights = np.array([-T[:3, 1] @ up_world for T in T_world_cam.values()])
+    sure = np.abs(heights) > np.sin(np.radians(STEEP_DEG))
+    if np.count_nonzero(sure & (heights < 0.0)) > np.count_nonzero(sure) / 2:
+        raise CalibrationError(
+            "The accelerometers say that most cameras hang upside down (rolled over 90 degrees about their axis): "
+            "their sign or axes are not what is assumed, or the cameras are mounted so; "
+            "calibrate with --up-from target."
+        )
+
+
 def beside_world(
     heard: UpByAccelerometers, R_new_world: Array, config: AlignConfig, kept_up: UpAxis | None
 ) -> GravityTestimony:
@@ -127,22 +150,32 @@ def gravity_readings(gravity: GravityTestimony | None) -> Iterator[Reading]:
     if gravity is None:
         return
     if gravity.tilt_deg is not None:
-        sentence = (
-            f"The accelerometers of {_named(gravity.heard)} say that up is {gravity.tilt_deg:.1f} degrees off: the "
-            "target did not lie level, or the wrong face of it was taken for level; take up from them with "
-            "--up-from imu, or from the floor with refine-ground-plane."
-        )
-        yield Reading(gate=TILT, value=gravity.tilt_deg, sentence=sentence)
+        yield Reading(gate=TILT, value=gravity.tilt_deg, sentence=_tilt_sentence(gravity.heard, gravity.tilt_deg))
     if len(gravity.heard.disagreement_deg) > 1:
         sentence = f"{_contradiction(gravity.heard)}: look at the views of such a camera, its pose may be tilted."
         yield Reading(gate=ODD, value=float(len(gravity.heard.odd)), sentence=sentence)
 
 
+def _tilt_sentence(heard: UpByAccelerometers, tilt_deg: float) -> str:
+    told = f"The accelerometers of {_named(heard)} say that up is {tilt_deg:.1f} degrees off: "
+    if tilt_deg > OPPOSITE_DEG:
+        return (
+            f"{told}they point the other way: their sign or axes are not what is assumed, unless this world is upside "
+            "down; see in the result whether the cameras stand above the floor."
+        )
+    return (
+        f"{told}the target did not lie level, or the wrong face of it was taken for level; take up from them with "
+        "--up-from imu, or from the floor with refine-ground-plane."
+    )
+
+
 def gravity_remarks(gravity: GravityTestimony | None) -> tuple[str, ...]:
     """Said with the verdict where they bear out what was found without them."""
-    if gravity is None or not gravity.confirms:
+    if gravity is None or gravity.tilt_deg is None or not gravity.confirms:
         return ()
-    return (f"Up agrees with the accelerometers of {_named(gravity.heard)} within {gravity.tilt_deg:.1f} degrees.",)
+    # Nobody's up is known to a hundredth of a degree, and none to nothing.
+    within = "to better than 0.1" if gravity.tilt_deg < 0.1 else f"within {gravity.tilt_deg:.1f}"
+    return (f"Up agrees with the accelerometers of {_named(gravity.heard)} {within} degrees.",)
 
 
 def _contradiction(heard: UpByAccelerometers) -> str:

@@ -10,9 +10,10 @@ Frames are kept in ``<out>.part``, a folder, until all are there.
 from __future__ import annotations
 
 import shutil
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -28,6 +29,7 @@ from rigcal.config import Resources
 from rigcal.conversion_state import Indices, held, state_of
 from rigcal.recordings import plain_options
 from rigcal.sources import STATE_FILE, UNFINISHED_SUFFIX, open_recordings
+from rigcal.sources.mcap_growing import has_chunk
 from rigcal.sources.mcap_writer import McapFrames
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.rgbd_writer import RgbdFrames, refuse_unusable_name
@@ -102,6 +104,8 @@ def convert_recording(
     _refuse_place(out, paths)
     options = options or plain_options()
     recording = open_recordings(paths, options)
+    for camera in recording.cameras:
+        refuse_unusable_name(camera.name)
     depth = _wants_depth(recording, depth)
     wanted = _wanted(recording, every)
     goal = out.resolve()
@@ -109,24 +113,48 @@ def convert_recording(
     state = state_of(recording, wanted, _options_that_matter(options, out, depth, every))
     _tell_what_is_left_behind(recording)
     try:
-        with held(part, state):
+        with held(part, state), _nothing_left_of_nothing(part):
             frames = _frames(recording, part, out, depth)
             converted = _convert(recording, wanted, frames, depth, progress, part)
             _appear(part, goal)
     except OSError as error:
+        kept = f" (finished frames are in {part.name})" if _holds_frames(part) else ""
         raise OutputError(
-            f"{out}: cannot be written ({error.strerror or error}); make room or choose another place (finished frames "
-            f"are in {part.name})."
+            f"{out}: cannot be written ({error.strerror or error}); make room or choose another place{kept}."
         ) from error
     return replace(converted, out=out)
+
+
+@contextmanager
+def _nothing_left_of_nothing(part: Path) -> Iterator[None]:
+    """Remove the folder of unfinished frames where it ends without any."""
+    try:
+        yield
+    except BaseException:
+        if not _holds_frames(part):
+            shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def _holds_frames(part: Path) -> bool:
+    try:
+        growing = part / GROWING_FILE
+        return has_chunk(growing) if growing.is_file() else any(part.glob("*/image/*.png"))
+    except (OSError, ValueError):  # what cannot be looked into is not thrown away
+        return True
 
 
 def _refuse_place(out: Path, paths: Sequence[Path]) -> None:
     from rigcal.cli import refuse_inputs
 
     refuse_inputs(out, paths, None)
-    known = out.suffix.lower() in (MCAP_SUFFIX, "")
-    if not known and out.suffix.lower() in (".bag", ".db3", ".svo", ".svo2", ".mp4", ".mkv", ".avi", UNFINISHED_SUFFIX):
+    for path in paths:
+        if path.is_dir() and path.resolve() in out.resolve().parents:
+            raise OutputError(f"{out}: lies in {path}, an input; choose another place.")
+    suffix = out.suffix.lower()
+    # A folder may be called 2025.06.01 or box_1.5m.
+    is_file_type = suffix[1:2].isalpha() and suffix != MCAP_SUFFIX
+    if suffix == UNFINISHED_SUFFIX or (is_file_type and not out.is_dir()):
         raise OutputError(
             f"{out}: recordings are converted to an RGB-D folder or to an {MCAP_SUFFIX} file; choose such a name."
         )
@@ -169,8 +197,6 @@ def _options_that_matter(options: SourceOptions, out: Path, depth: bool, every: 
 
 
 def _frames(recording: Recording, part: Path, out: Path, depth: bool) -> _Frames:
-    for camera in recording.cameras:
-        refuse_unusable_name(camera.name)
     if out.suffix.lower() == MCAP_SUFFIX:
         names = [camera.name for camera in recording.cameras]
         with_depth = {name for name in names if depth and len(recording.depth_indices(name))}
@@ -187,22 +213,41 @@ def _convert(
     kept = total - sum(map(len, missing.values()))
     if kept:
         logger.info("{}: an earlier run finished {} of {} frames; going on from there", part, kept, total)
-    bad = done = 0
+    bad: Counter[str] = Counter()
+    done = 0
     try:
         for packed in _packed(_by_time(recording, missing, depth), frames):
             if isinstance(packed, BadFrame):
-                bad += 1
-                _tell_bad(packed, bad)
+                bad[packed.camera] += 1
+                _tell_bad(packed, bad.total())
             else:
                 frames.store(packed)
             done += 1
             progress.step("convert", kept + done, total)
+        cameras = _with_frames({name: len(indices) - bad[name] for name, indices in wanted.items()})
         frames.finish()
     except BaseException:
         frames.close()
-        logger.info("{}: {} finished frames are kept; the same command goes on from there", part, kept + done - bad)
+        if there := kept + done - bad.total():
+            logger.info("{}: {} finished frames are kept; the same command goes on from there", part, there)
         raise
-    return Converted(out=part, cameras=len(recording.cameras), written=kept + done - bad, kept=kept, bad=bad)
+    return Converted(out=part, cameras=cameras, written=total - bad.total(), kept=kept, bad=bad.total())
+
+
+def _with_frames(counts: Mapping[str, int]) -> int:
+    """How many cameras have a frame that was written; those without are named."""
+    without = [name for name, count in counts.items() if not count]
+    if len(without) == len(counts):
+        raise InputError(
+            "no frame of the recording can be read, so nothing is written; copy it again, or record it again."
+        )
+    if without:
+        logger.warning("of {} no frame was written: {}", "a camera" if len(without) == 1 else "cameras", _some(without))
+    return len(counts) - len(without)
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:10]) + (f" and {len(names) - 10} others" if len(names) > 10 else "")
 
 
 def _missing(recording: Recording, wanted: Indices, frames: _Frames) -> Indices:

@@ -63,15 +63,9 @@ def read_cameras(path: Path) -> Mapping[str, Camera]:
 
 
 def _depth_mode(word: str) -> str:
-    mode = word.upper()
-    if mode == "FILL":
-        raise InputError(
-            "--depth-mode FILL: invents distances where none were measured, which spoils a calibration; leave it out, "
-            "or choose NEURAL."
-        )
-    if mode not in DEPTH_MODES:
-        raise InputError(f"--depth-mode {word}: no mode of the ZED SDK that is known here; choose {DEPTH_MODES[0]}.")
-    return mode
+    from rigcal.sources.zed_sdk import depth_mode_named
+
+    return depth_mode_named(word, DEPTH_MODES)
 
 
 def _head(path: Path) -> str:

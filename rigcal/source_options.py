@@ -27,7 +27,8 @@ _OPTIONS = (
                  help="Of a ROS bag or MCAP file: a camera's image, camera info and depth topics; repeatable. Default: "
                       "paired by their names."),
     click.option("--same-clock", is_flag=True,
-                 help="Videos without time stamps beside them began at the same moment."),
+                 help="Videos without time stamps beside them began at the same moment: each counts from its first "
+                      "picture."),
     click.option("--intrinsics", type=click.Path(path_type=Path), metavar="FILE",
                  help="Intrinsics of the cameras of videos, or of bags without camera info: camera_info, OpenCV or "
                       "Kalibr YAML, aniposelib TOML. Default: looked for beside the videos."),

@@ -46,6 +46,7 @@ def quality_of(
     kept: KeptCheck = NOTHING_COMPARED,
     depth_scale: DepthScale | None = None,
     up_is_guess: bool = False,
+    up_by_imu: bool = False,
     gravity: GravityTestimony | None = None,
     target_estimated: bool = False,
 ) -> Quality:
@@ -57,6 +58,7 @@ def quality_of(
         kept: What the views say about cameras that an earlier calibration placed.
         depth_scale: What depth cameras say of the marker map's scale, where there are any.
         up_is_guess: Whether up is that of a single frame of a moved target.
+        up_by_imu: Whether up is that of accelerometers, not the target's.
         gravity: What accelerometers say of up, where the recording has them.
         target_estimated: Whether the marker map was corrected by the same frames.
     """
@@ -71,7 +73,7 @@ def quality_of(
         *_splits(v, v.early_late, "early-late", "The first and the second half of the recording"),
         *_views(v),
         *_kept(v, kept),
-        *_heights(below_target_m or {}),
+        *_heights(below_target_m or {}, up_by_imu=up_by_imu),
         *_scale(depth_scale),
         *_up(up_is_guess and not (gravity is not None and gravity.confirms)),
         *gravity_readings(gravity),
@@ -337,13 +339,14 @@ def bumped(name: str, kept: Sequence[int], rejected: Sequence[int]) -> str:
     return ""
 
 
-def _heights(below_target_m: Mapping[str, float]) -> Iterator[Reading]:
+def _heights(below_target_m: Mapping[str, float], *, up_by_imu: bool) -> Iterator[Reading]:
     if not below_target_m:
         return
     name, depth = _worst(below_target_m)
+    way_out = "take up from the target with --up-from target" if up_by_imu else "pass --ground-face"
     sentence = (
         f"Camera {name} stands {depth:.1f} m below the target's lowest point: unless it really does, the world is "
-        "upside down or mirrored; check the order of corners in the marker map and pass --ground-face."
+        f"upside down or mirrored; check the order of corners in the marker map and {way_out}."
     )
     yield Reading(gate="camera below the target", value=depth, sentence=sentence)
 

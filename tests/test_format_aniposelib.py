@@ -183,3 +183,20 @@ def test_what_is_wrong_is_said(old: str, new: str, words: str, tmp_path: Path) -
     with pytest.raises(InputError, match=words) as caught:
         registry.read_rig(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("part", ["a", "a0-_", '"a b"', "'a.b'"])
+@pytest.mark.parametrize("form", ["{} = 1", "[{}]", "x = {{ {} = 1 }}"])
+def test_keys_that_would_swell_are_refused(part: str, form: str, tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    for joint in (".", " . "):
+        path.write_text(form.format(joint.join([part] * 20_000)))
+        with pytest.raises(InputError, match="key of 20000 parts"):  # tomllib takes minutes for it
+            FORMAT.read(path)
+
+
+def test_dots_in_texts_and_comments_are_no_keys(tmp_path: Path) -> None:
+    path = written(format_rig(KINDS), tmp_path)
+    dots = "a." * 100
+    path.write_text(f'x = "{dots}"\ny = \'{dots}\'\nz = """\n{dots}\n"""  # {dots}\n' + path.read_text())
+    assert list(FORMAT.read(path).T_world_cam) == sorted(KINDS)

@@ -174,3 +174,17 @@ def test_a_damaged_rig_configuration_is_refused(folder: Path):
     (folder / "rig_config.json").write_text(json.dumps({"cameras": []}))
     with pytest.raises(InputError, match=r"rig_config\.json"):
         FORMAT.read(folder)
+
+
+@pytest.mark.parametrize("pattern", ["{camera}.png", "cam_{camera}/1.png", "x/a{camera}/1.png"])
+def test_a_camera_wants_a_folder_of_its_own(pattern: str, rig: Rig, tmp_path: Path):
+    with pytest.raises(InputError, match="by their folder"):
+        FORMAT.write(rig, tmp_path / "m", ExportOptions(image_name=pattern))
+    assert not (tmp_path / "m").exists()
+
+
+def test_images_that_fall_on_one_name_are_named(tmp_path: Path):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a/left/1.png\n\n2 1 0 0 0 1 0 0 1 b/left/1.png\n\n")
+    with pytest.raises(InputError, match=r"'a/left/1\.png' and 'b/left/1\.png' .*camera left, by the last folder"):
+        FORMAT.read(tmp_path)

@@ -191,3 +191,12 @@ def test_a_file_without_focal_length_gives_poses_only(tmp_path: Path):
     del content["fl_x"]
     path.write_text(json.dumps(content))
     assert FORMAT.read(path).cameras == {}
+
+
+@pytest.mark.parametrize("model", [["OPENCV"], {}, 1, None])
+def test_a_camera_model_that_is_no_word_is_refused(model: object, tmp_path: Path):
+    content = written(format_rig(BENT), tmp_path)
+    path = tmp_path / "other.json"
+    path.write_text(json.dumps({**content, "camera_model": model}))
+    with pytest.raises(InputError, match="no counterpart"):
+        FORMAT.read(path)

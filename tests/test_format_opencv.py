@@ -179,3 +179,10 @@ def test_skew_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="skew of camera a"):
         written(skewed, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a'b", " a", "a ", '"a"', '"'])
+def test_names_that_cv2_misspells_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="opencv cannot hold the name"):
+        FORMAT.write(Rig(T_world_cam={name: np.eye(4)}), tmp_path / "rig.yaml", ExportOptions())
+    assert not (tmp_path / "rig.yaml").exists()

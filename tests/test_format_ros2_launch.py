@@ -132,7 +132,7 @@ def test_both_kinds_of_files_say_the_same(tmp_path: Path, monkeypatch: pytest.Mo
 def test_written_and_read_it_is_the_same_rig(
     tmp_path: Path, name: str, seed: int, pattern: str, warnings_said: list[str]
 ):
-    rig = random_rig(seed, names=("34563472", "front_left", "cam-1 é", "_x2d_", "x"))
+    rig = random_rig(seed, names=("34563472", "front_left", "cam-1 é", "a_x2d_", "x"))
     options = ExportOptions(frame_name=pattern, parent_frame="map/hall")
     FORMAT.write(rig, tmp_path / name, options)
     once = FORMAT.read(tmp_path / name)
@@ -281,14 +281,14 @@ def test_frames_in_two_worlds_or_twice_are_refused(tmp_path: Path):
         ("", "holds no frame of a camera"),
         ("def (", "not readable as Python"),
         ("x = " + "(" * 10_000, "not readable as Python"),
-        ("x = 1" + "+1" * 1_000_000, ""),  # whether it is too deep or has no camera
+        ("x = 1" + "+1" * 400_000, ""),  # whether it is too deep or has no camera
         ("\0", "not readable as Python"),
         ("<launch>", "not readable as XML"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><launch/>', "DOCTYPE"),
         ("<launch/>", "holds no frame of a camera"),
         ('<launch><node exec="static_transform_publisher" args="&quot;"/></launch>', "cannot be parted"),
         ('<launch><node exec="static_transform_publisher" args="--x $(var x)"/></launch>', "is not understood"),
-        ("#" * (5 * 2**20), "over 4096 KiB"),
+        ("#" * (5 * 2**20), "over 1024 KiB"),
     ],
 )
 def test_files_that_cannot_be_used_say_why(tmp_path: Path, text: str, message: str):

@@ -84,3 +84,10 @@ def test_what_is_wrong_is_said_with_its_line(text: str, words: str, tmp_path: Pa
     with pytest.raises(InputError, match=words) as caught:
         registry.read_rig(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_long_trajectory_is_no_rig(tmp_path: Path) -> None:
+    path = tmp_path / "way.txt"
+    path.write_text("0 0 0 0 0 0 0 1\n" * 70_000)
+    with pytest.raises(InputError, match="over 1024 KiB"):
+        FORMAT.read(path)

@@ -265,3 +265,10 @@ def test_no_text_makes_the_parser_fail_otherwise(text: str):
         parsed("#usda 1.0\n" + text)
     except UsdTextError:
         return
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usdz", ".txt", ""])
+def test_a_name_that_promises_another_layout_is_refused(suffix: str, tmp_path: Path):
+    with pytest.raises(InputError, match=r"like rig\.usda"):
+        FORMAT.write(format_rig({"a": "pinhole"}), tmp_path / f"rig{suffix}", ExportOptions())
+    FORMAT.write(format_rig({"a": "pinhole"}), tmp_path / "rig.usd", ExportOptions())

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ from upright_rigs import SAME, SAME_PX, farthest, level_camera, pixels, points_b
 
 from aruco.errors import InputError, OutputError
 from aruco.model import UpAxis
-from aruco.pose_math import make_pose
+from aruco.pose_math import Array, Pose, make_pose
 from rigcal.formats import json_edit
 from rigcal.formats.rig import ExportOptions, Rig
-from rigcal.formats.zed_fusion import FORMAT, SYSTEMS, sdk_pose
+from rigcal.formats.zed_fusion import FORMAT
 
 # A pose that a real ZED360 of SDK 5.4 wrote, and where the SDK says that the camera is in three of its systems.
 REAL_POSE = (
@@ -35,6 +36,23 @@ REAL_CENTRES = {
     "RIGHT_HANDED_Z_UP_X_FWD": (1.296, -1.756, 0.572),
 }
 MILLIMETRE = 1e-3  # as many decimals as the vector is given with
+
+# The SDK's coordinate systems: their axes in terms of the IMAGE axes.
+SYSTEMS: Mapping[str, Array] = {
+    "IMAGE": np.eye(3),
+    "LEFT_HANDED_Y_UP": np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, 1]]),
+    "RIGHT_HANDED_Y_UP": np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]),
+    "RIGHT_HANDED_Z_UP": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "LEFT_HANDED_Z_UP": np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]]),
+    "RIGHT_HANDED_Z_UP_X_FWD": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+}
+
+
+def sdk_pose(T_disk: Pose, system: str) -> Pose:
+    """The pose that the SDK gives for one in a file, when it is told to use a coordinate system of SYSTEMS."""
+    M = np.eye(4)
+    M[:3, :3] = SYSTEMS[system]
+    return M @ T_disk @ M.T
 
 
 @pytest.fixture
@@ -370,3 +388,10 @@ def test_it_is_recognised_by_its_content(tmp_path: Path, real_file: Path):
     assert FORMAT.recognises(tmp_path, json.dumps(old_entry([0, 0, 0], [0, 0, 0])).encode())
     for head in (b"", b"{", b'{"1": {"pose": "1 0 0"}}', b"<robot>", b'["FusionConfiguration"]', b"\xff\xfe\x00"):
         assert not FORMAT.recognises(tmp_path, head)
+
+
+def test_many_cameras_are_refused_as_fast_as_they_are_read(tmp_path: Path):
+    path = tmp_path / "many.json"
+    path.write_text("{" + ",".join(f'"{k}": {{"world": 0}}' for k in range(1, 60_000)) + "}")
+    with pytest.raises(InputError, match="is not a camera"):
+        FORMAT.read(path)  # counting each name among all others takes half a minute

@@ -28,6 +28,7 @@ from rigcal.gravity_witness import (
     gravity_remarks,
     hear_gravity,
     heard_again,
+    require_upright,
     trusted_up,
 )
 from rigcal.pipeline import calibrate, calibrate_seen
@@ -143,6 +144,34 @@ def test_up_from_accelerometers_is_up(demo: Simulation, seen: Evidence, up_axis:
     assert np.degrees(tilt_error(calibrated(seen, ups).T_world_cam, room, UP)) > 7
 
 
+def test_accelerometers_of_the_wrong_sign_do_not_turn_the_world(demo: Simulation, seen: Evidence):
+    negated = {name: -up for name, up in true_up(demo).items()}
+    with pytest.raises(CalibrationError, match=r"most cameras hang upside down.*--up-from target"):
+        calibrated(seen, negated, up_from="imu")
+    found = calibrated(seen, negated)
+    reasons = " ".join(found.notes["quality"]["reasons"])
+    assert "they point the other way: their sign or axes are not what is assumed" in reasons
+    assert "--up-from imu" not in reasons
+    assert found.notes["quality"]["verdict"] == "bad"
+
+
+def test_only_a_majority_that_can_tell_hangs_upside_down():
+    up = np.array(UP)
+    upright = np.diag([1.0, -1.0, -1.0, 1.0])
+    hanging = np.diag([-1.0, 1.0, -1.0, 1.0])
+    downwards = make_pose(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros(3))
+    # Looking 60 degrees down and rolled by 60 degrees it is not upside down, by 120 degrees it is.
+    pitch = exp_so3(np.radians([-60.0, 0, 0]))
+    rolled = {
+        deg: make_pose(pitch @ upright[:3, :3] @ exp_so3(np.radians([0, 0, deg])), np.zeros(3)) for deg in (60.0, 120.0)
+    }
+    for cameras in ([upright, hanging], [downwards], [upright, downwards, rolled[60.0]]):
+        require_upright({str(k): T for k, T in enumerate(cameras)}, up)
+    for cameras in ([hanging], [upright, hanging, hanging], [downwards, rolled[120.0]]):
+        with pytest.raises(CalibrationError, match="upside down"):
+            require_upright({str(k): T for k, T in enumerate(cameras)}, up)
+
+
 def test_one_odd_accelerometer_is_named_and_changes_nothing(demo: Simulation, seen: Evidence):
     ups = true_up(demo)
     name = min(ups)
@@ -222,6 +251,8 @@ def test_only_a_small_tilt_confirms():
     assert of_one(0.4).confirms
     assert not of_one(5.0).confirms
     assert not of_one(None).confirms
+    assert "within 0.4 degrees" in gravity_remarks(of_one(0.4))[0]
+    assert "to better than 0.1 degrees" in gravity_remarks(of_one(0.0))[0]
     assert gravity_remarks(of_one(5.0)) == gravity_remarks(None) == ()
     assert [reading.gate for reading in gravity_readings(of_one(0.4))] == ["up by accelerometers"]
     assert list(gravity_readings(None)) == []

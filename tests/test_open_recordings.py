@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +27,9 @@ from rigcal.sources.camera_info import dump_camera_info
 from rigcal.sources.joined import JoinedRecording, disagreeing_clocks, joined
 from rigcal.sources.options import DEPTH_MODES, SourceOptions
 from rigcal.sources.rgbd_folder import RgbdFolder
+from rigcal.sources.rosbag2_sqlite import SqliteStore
 from rigcal.sources.unknown import KNOWN
+from rigcal.sources.zed_player import RefusedError
 
 W, H = 64, 48
 K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
@@ -208,6 +213,80 @@ def test_svo2_goes_through_the_sdk_only_where_that_is_installed(
     assert zed == ["svo2", "sdk", "svo2"]
 
 
+@pytest.mark.parametrize("reason", ["NO_GPU_DETECTED", "CALIBRATION_FILE_NOT_AVAILABLE", "INVALID_SVO_FILE"])
+def test_svo2_that_the_sdk_refuses_is_read_without_it(
+    zed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str], reason: str
+) -> None:
+    def refusing(path: Path, options: SourceOptions) -> Source:
+        raise RefusedError(f"{path}: the ZED SDK cannot open it ({reason}); do something.")
+
+    monkeypatch.setattr(zed_sdk, "is_available", lambda: True)
+    monkeypatch.setattr(zed_sdk, "opened", refusing)
+    open_recordings([put(tmp_path / "a.svo2")])
+    assert zed == ["svo2"]
+    (sentence,) = said
+    assert f"a.svo2: the ZED SDK cannot open it ({reason})" in sentence
+    assert "read without the SDK" in sentence
+
+    with pytest.raises(InputError, match=reason):  # nobody else reads these
+        open_recordings([put(tmp_path / "a.svo")])
+
+    def damaged(path: Path, options: SourceOptions) -> Source:
+        raise InputError(f"{path}: damaged")
+
+    monkeypatch.setattr(svo2, "opened", damaged)
+    with pytest.raises(InputError, match=r"a\.svo2: damaged"):
+        open_recordings([tmp_path / "a.svo2"])
+
+
+def test_other_errors_of_the_sdk_are_the_users_to_mend(
+    zed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrong(path: Path, options: SourceOptions) -> Source:
+        raise InputError("--depth-mode TERRA: no such mode")
+
+    monkeypatch.setattr(zed_sdk, "is_available", lambda: True)
+    monkeypatch.setattr(zed_sdk, "opened", wrong)
+    with pytest.raises(InputError, match="TERRA"):
+        open_recordings([put(tmp_path / "a.svo2")])
+    assert zed == []
+
+
+def test_stereo_depth_of_svo_files_is_said_to_be_the_sdks(zed: list[str], tmp_path: Path, said: list[str]) -> None:
+    paths = [put(tmp_path / name) for name in ("a.svo", "b.svo", "c.svo2")]
+    open_recordings(paths, SourceOptions(stereo_depth=True))
+    assert zed == ["sdk", "sdk", "svo2"]
+    (sentence,) = said
+    assert f"{paths[0]}, {paths[1]} only the ZED SDK reads, so its own depth is used" in sentence
+    said.clear()
+    open_recordings(paths)
+    open_recordings(paths[2:], SourceOptions(stereo_depth=True))
+    assert said == []
+
+
+def test_one_unnamed_conf_is_not_that_of_two_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    conf = put(tmp_path / "mine.conf", b"[STEREO]")
+
+    class Unread(svo2.Svo2):
+        def __init__(self, path: Path, options: SourceOptions) -> None:
+            self.source = Source(path.stem)
+
+        @property
+        def cameras(self) -> tuple[Camera, ...]:
+            return self.source.cameras
+
+        def stamps_ns(self, camera: str) -> NDArray[np.int64]:
+            return self.source.stamps_ns(camera)
+
+    monkeypatch.setattr(svo2, "recognises", lambda path, head: path.suffix == ".svo2")
+    monkeypatch.setattr(svo2, "opened", Unread)
+    monkeypatch.setattr(zed_sdk, "is_available", lambda: False)
+    paths = [put(tmp_path / "111.svo2"), put(tmp_path / "222.svo2")]
+    open_recordings(paths[:1], SourceOptions(zed_conf=conf))
+    with pytest.raises(InputError, match=r"mine\.conf: does not say whose .* 111, 222"):
+        open_recordings(paths, SourceOptions(zed_conf=conf))
+
+
 def test_a_folder_of_svo_files_is_one_recording(zed: list[str], tmp_path: Path) -> None:
     for name in ("a.svo2", "b.svo2", "c.svo"):
         put(tmp_path / "takes" / name)
@@ -339,7 +418,7 @@ def test_options_of_the_command_reach_the_readers() -> None:
     assert options_from(GIVEN).depth_mode == SourceOptions().depth_mode
 
 
-@pytest.mark.parametrize(("mode", "words"), [("FILL", "invents distances"), ("fast", "no mode of the ZED SDK")])
+@pytest.mark.parametrize(("mode", "words"), [("FILL", "invents distances"), ("fast", "the ZED SDK has no such mode")])
 def test_depth_modes_that_cannot_be_are_refused(mode: str, words: str) -> None:
     with pytest.raises(InputError, match=f"--depth-mode {mode}: .*{words}"):
         options_from({**GIVEN, "depth_mode": mode})
@@ -366,3 +445,66 @@ def test_a_converted_folder_is_read_by_the_plain_reader_too(
     write: Callable[[Path, Source], Path], tmp_path: Path
 ) -> None:
     assert RgbdFolder(write(tmp_path / "out", Source("a"))).stamps_ns("a")[0] == START_NS
+
+
+# What a newcomer met
+
+
+@pytest.mark.parametrize("kind", ["folder", "files"])
+def test_a_file_that_is_named_like_a_recording_and_left_out_is_named(
+    kind: str, write: Callable[[Path, Source], Path], tmp_path: Path, said: list[str]
+) -> None:
+    takes = tmp_path / "takes"
+    for name in ("a", "b"):
+        write(takes / (name if kind == "folder" else f"{name}.mcap"), Source(name))
+    assert len(open_recordings([takes]).cameras) == 2
+    assert said == []
+    put(takes / "c.mkv", b"")
+    put(takes / "d.mp4", b"to be recorded")
+    put(takes / "notes.txt", b"to be recorded")
+    words = {"c.mkv": "is empty", "d.mp4": "is a text file"}
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(takes / "e.mp4")
+        words["e.mp4"] = "is no file"
+    assert len(open_recordings([takes]).cameras) == 2
+    assert len(said) == len(words)
+    for line, (name, why) in zip(said, words.items()):
+        assert line.startswith(f"{takes / name}: is left out: {why}")
+
+
+def test_text_named_svo_is_called_text(tmp_path: Path) -> None:
+    for name in ("a.svo", "a.svo2"):
+        with pytest.raises(InputError, match=f"is a text file, not a recording although it is named {name[1:]}"):
+            open_recordings([put(tmp_path / name, b"version https://git-lfs.github.com/spec/v1")])
+
+
+def cut_off_bag(folder: Path) -> Path:
+    """A rosbag2 folder of 40 images of one topic, all of them before the cut, and 40 of another, all behind it."""
+    folder.mkdir()
+    with closing(sqlite3.connect(folder / "rig.db3")) as base, base:
+        base.execute("CREATE TABLE topics (id INTEGER PRIMARY KEY, name, type, serialization_format)")
+        base.execute("CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
+        topics = [(k, f"/{name}/image_raw", "sensor_msgs/msg/Image", "cdr") for k, name in enumerate(("a", "b"))]
+        base.executemany("INSERT INTO topics VALUES (?, ?, ?, ?)", topics)
+        rows = [(k, k // 40, START_NS + k, bytes(5000)) for k in range(80)]
+        base.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+    about = [{"topic_metadata": {"name": name, "type": kind}, "message_count": 40} for _, name, kind, _ in topics]
+    bag = {"relative_file_paths": ["rig.db3"], "message_count": 80, "topics_with_message_count": about}
+    (folder / "metadata.yaml").write_text(json.dumps({"rosbag2_bagfile_information": bag}))  # which is YAML too
+    data = (folder / "rig.db3").read_bytes()
+    (folder / "rig.db3").write_bytes(data[: len(data) // 3])
+    return folder / "rig.db3"
+
+
+def test_of_a_cut_off_bag_it_is_said_how_much_is_lost_and_which_cameras(tmp_path: Path, said: list[str]) -> None:
+    path = cut_off_bag(tmp_path / "bag")
+    found = SqliteStore(path).topics["/a/image_raw"].count
+    assert 0 < found < 40
+    assert said == [
+        f"{path}: is damaged or cut off; the {found} of 80 messages that are found are used",
+        f"{path}: nothing was found of /b/image_raw (40)",
+    ]
+    said.clear()
+    path.with_name("metadata.yaml").write_text("rosbag2_bagfile_information: [3]")
+    SqliteStore(path)
+    assert said == [f"{path}: is damaged or cut off; the {found} messages that are found are used"]

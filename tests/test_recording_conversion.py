@@ -484,3 +484,84 @@ def test_the_state_tells_what_is_converted(convert: Callable[..., Converted], tm
     state = json.loads((tmp_path / "out.part" / "conversion.json").read_text())
     assert state["options"] == {"to": "rgbd", "every": 3, "depth": {"mode": "NEURAL", "stereo": False}}
     assert state["cameras"].keys() == {"1234", "grey"}
+
+
+# What a newcomer met
+
+
+@pytest.mark.parametrize("name", ["out", "out.mcap"])
+def test_a_recording_without_a_readable_frame_is_refused_and_leaves_nothing(
+    convert: Callable[..., Converted], tmp_path: Path, name: str
+) -> None:
+    source = Source(bad=range(8))
+    source.cameras = source.cameras[:1]
+    with pytest.raises(InputError, match="no frame of the recording can be read"):
+        convert(source, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["out", "out.mcap"])
+def test_a_camera_that_ends_without_a_frame_is_named(
+    convert: Callable[..., Converted], tmp_path: Path, name: str, said: list[str]
+) -> None:
+    converted = convert(Source(bad=range(8)), tmp_path / name)
+    assert (converted.cameras, converted.written, converted.bad) == (1, 4, 8)
+    assert "of a camera no frame was written: 1234" in said
+
+
+def test_a_camera_name_that_no_folder_can_have_is_refused_before_anything_is_made(
+    convert: Callable[..., Converted], tmp_path: Path
+) -> None:
+    source = Source()
+    source.cameras = (Camera(name="x" * 400, width=W, height=H, K=K), source.cameras[1])
+    for out in ("out", "out.mcap"):
+        with pytest.raises(OutputError, match="rename the camera") as error:
+            convert(source, tmp_path / out)
+        assert len(str(error.value)) < 200
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["out", "out.mcap"])
+def test_where_nothing_was_finished_nothing_is_left_and_nothing_promised(
+    convert: Callable[..., Converted], tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: object, packed: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("rigcal.sources.rgbd_writer.RgbdFrames.store", full)
+    monkeypatch.setattr("rigcal.sources.mcap_writer.McapFrames.store", full)
+    with pytest.raises(OutputError, match="No space left") as error:
+        convert(Source(), tmp_path / name)
+    assert "finished frames" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_that_are_not_whole_are_written_again(
+    convert: Callable[..., Converted], tmp_path: Path, said: list[str]
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        convert(Source(), tmp_path / "out", progress=StopAfter(12))
+    folder = tmp_path / "out.part" / "1234"
+    images, depths = (sorted((folder / kind).iterdir()) for kind in ("image", "depth"))
+    images[0].write_bytes(b"")
+    images[1].write_bytes(images[1].read_bytes()[:-20])
+    images[2].write_bytes(bytes(images[2].stat().st_size))
+    depths[3].write_bytes(depths[3].read_bytes()[:100])
+    assert convert(Source(), tmp_path / "out").kept == 12 - 4
+    assert any("4 frames are not whole" in line for line in said)
+    assert_same(RgbdFolder(tmp_path / "out"), Source())
+
+
+def test_a_result_never_goes_into_an_input_nor_under_a_name_of_another_kind(
+    convert: Callable[..., Converted], demo_folder: Path, tmp_path: Path
+) -> None:
+    for out in (demo_folder / "new", demo_folder / "new.mcap", demo_folder / "a" / "b"):
+        with pytest.raises(OutputError, match=r"lies in .*, an input"):
+            convert_recording([demo_folder], out)
+        assert not out.exists()
+    with pytest.raises(OutputError, match=r"x\.txt: recordings are converted to an RGB-D folder or to an \.mcap file"):
+        convert(Source(), tmp_path / "x.txt")
+    (tmp_path / "x.txt").mkdir()
+    for name in ("x.txt", "2025.06.01", "box_1.5m"):
+        convert(Source(), tmp_path / name)
+        assert_same(RgbdFolder(tmp_path / name), Source())

@@ -663,3 +663,46 @@ def test_real_recordings_are_read(name: str, n_frames: int, has_depth: bool) -> 
         for frame in recording.frames(camera.name, [0, n_frames - 1], depth=True):
             assert good(frame).image.shape[:2] == (camera.height, camera.width)
             assert (good(frame).depth_m is not None) == has_depth
+
+
+# Beside other recordings
+
+
+def videos(folder: Path, *names: str) -> None:
+    for name in names:
+        put(folder, name, b"\0\0\0\x18ftypmp42" + bytes(range(256)))
+
+
+@pytest.mark.parametrize("infos", [("left/camera_info.yaml", "right/camera_info.yaml"), ("camera_info.yaml",)])
+def test_descriptions_of_cameras_beside_videos_are_the_videos(
+    infos: Sequence[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[str] = []
+    recording = RgbdFolder(make_camera(tmp_path / "rec" / "a", {"1.png": encoded(picture(0))}))
+    monkeypatch.setattr(
+        "rigcal.sources.video.opened_together",
+        lambda paths, options: given.extend(path.name for path in paths) or recording,
+    )
+    films = tmp_path / "films"
+    videos(films, "left.mp4", "right.mp4")
+    for info in infos:
+        (films / info).parent.mkdir(exist_ok=True)
+        (films / info).write_text(dump_camera_info(camera_named("left")))
+    open_recordings([films])
+    assert given == ["left.mp4", "right.mp4"]
+
+
+def test_a_folder_of_descriptions_alone_is_told_that_images_are_missing(tmp_path: Path) -> None:
+    (tmp_path / "left").mkdir()
+    (tmp_path / "left/camera_info.yaml").write_text(dump_camera_info(camera_named("left")))
+    with pytest.raises(InputError, match="no camera has an image"):
+        open_recordings([tmp_path])
+
+
+def test_videos_beside_cameras_of_an_rgbd_folder_are_not_dropped(tmp_path: Path) -> None:
+    make_camera(tmp_path / "a", {"1.png": encoded(picture(0))})
+    videos(tmp_path, "b.mp4")
+    for path in (tmp_path, tmp_path / "a"):
+        videos(path, "b.mp4")
+        with pytest.raises(InputError, match=r"several kinds, .* \(RGB-D folder\), b\.mp4 \(video\)"):
+            open_recordings([path])

@@ -18,6 +18,7 @@ from mcap.writer import Writer as McapWriter
 from aruco.errors import InputError, MissingExtraError
 from aruco.model import BadFrame, Frame
 from rigcal.sources import open_recordings
+from rigcal.sources.chunked_file import Chunk, ChunkedFile
 from rigcal.sources.mcap_index import DamagedError, McapIndex
 
 COMPRESSIONS = ["NONE", "LZ4", "ZSTD"]
@@ -264,3 +265,22 @@ def test_a_cut_off_recording_is_used_and_told(tmp_path: Path, said: list[str]):
     assert len(recording.stamps_ns("cam")) == 2
     assert [(frame.width, frame.height) for frame in recording.cameras] == [SIZE]
     assert any(line.startswith(f"{path}: is cut off: the record at byte") for line in said)
+
+
+class Forgetful(ChunkedFile):
+    """One whose chunk is forgotten whenever it was looked at, as another thread may do."""
+
+    def __getattribute__(self, name: str) -> Any:
+        value = super().__getattribute__(name)
+        if name == "_cached" and value is not None:
+            self._cached = None
+        return value
+
+
+def test_another_thread_may_forget_a_chunk_at_any_moment(tmp_path: Path) -> None:
+    path = tmp_path / "chunks"
+    path.write_bytes(b"abcd")
+    chunk = Chunk(at=0, stored=4, stated=4, compression="")
+    chunked = Forgetful(path, [chunk], lambda read, at, end, channel: (at, end - at))
+    with path.open("rb") as file:
+        assert [bytes(chunked.contents(file, 0)) for _ in range(4)] == [b"abcd"] * 4

@@ -28,7 +28,7 @@ from aruco.errors import InputError, MissingExtraError
 from aruco.lens import project, undistort
 from aruco.model import BadFrame, Camera, Frame, KnowsUp
 from aruco.pose_math import exp_so3, make_pose, transform_points
-from rigcal.sources import svo2_pictures, zed_conf
+from rigcal.sources import stereo_depth, svo2_pictures, svo2_sensors, zed_conf
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.svo2 import Svo2, opened, recognises
 from rigcal.sources.svo2_payload import coding_of, eye_size, payload_of
@@ -300,6 +300,40 @@ def test_implausible_acceleration_tells_nothing(
     path = _recording(tmp_path, Clip(pairs=_pairs(2), accelerations=accelerations))
     assert opened(path, SourceOptions()).up_in_camera(SERIAL) is None
     assert any("accelerometer" in line for line in warned) == told
+
+
+def test_sensors_are_read_and_doubted_once(tmp_path: Path, warned: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    original = svo2_sensors.up_in_camera
+    monkeypatch.setattr(svo2_sensors, "up_in_camera", lambda *given: read.append(given[2]) or original(*given))
+    lying = [(0.0, -12.0, 0.0)] * 50
+    clips = {
+        "111": Clip(pairs=_pairs(2), accelerations=RESTING),
+        "222": Clip(pairs=_pairs(2), accelerations=lying),
+    }
+    recording = opened(_recording(tmp_path, clips), SourceOptions())
+    for _ in range(3):
+        assert recording.up_in_camera("111") is not None
+        assert recording.up_in_camera("222") is None
+    assert read == ["111", "222"]
+    assert sum("accelerometer" in line for line in warned) == 1
+
+
+def test_readers_with_depth_do_not_share_a_matcher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[stereo_depth.StereoMatcher] = []
+
+    class Noted(stereo_depth.StereoMatcher):
+        def __init__(self, **given: Any) -> None:
+            super().__init__(**given)
+            made.append(self)
+
+    monkeypatch.setattr(stereo_depth, "StereoMatcher", Noted)
+    recording = opened(_recording(tmp_path, Clip(pairs=_pairs(3))), SourceOptions(stereo_depth=True))
+    for _ in zip(recording.frames(SERIAL, [0, 1], depth=True), recording.frames(SERIAL, [1, 2], depth=True)):
+        pass
+    assert len(made) == 2  # not one for all, nor one for each frame
+    list(recording.frames(SERIAL, [0]))
+    assert len(made) == 2
 
 
 def test_a_truncated_file_gives_what_is_whole(tmp_path: Path, warned: list[str]) -> None:

@@ -16,6 +16,7 @@ from video_writer import H264, H265, MJPEG, moving_images, number_of, write_vide
 
 from aruco.errors import InputError
 from aruco.model import BadFrame, Camera, Frame
+from rigcal.sources import open_recordings
 from rigcal.sources.camera_info import dump_camera_info, load_camera_info
 from rigcal.sources.decoding import import_av
 from rigcal.sources.options import SourceOptions
@@ -372,6 +373,29 @@ def test_clocks_of_several_videos_must_be_known(two: list[Path]) -> None:
     with pytest.raises(InputError, match="no camera up among the videos; they are left, right"):
         recording.stamps_ns("up")
     opened(two[0], OPTIONS)  # one alone has no clock to compare with
+
+
+def test_one_moment_is_that_of_the_first_pictures_whatever_the_container(tmp_path: Path) -> None:
+    containers: dict[str, dict[str, Any]] = {
+        "a.mp4": {},
+        "b.ts": {},
+        "c.mp4": {"container": {"movflags": "frag_keyframe+empty_moov"}},
+    }
+    paths = [made(tmp_path / name, n=12, b_frames=2, **more) for name, more in containers.items()]
+    # The containers do not agree by themselves.
+    assert len({int(opened(path, OPTIONS).stamps_ns(path.stem)[0]) for path in paths}) > 1
+    recording = opened_together(paths, SourceOptions(read_cameras=read_ros, same_clock=True))
+    for path in paths:
+        np.testing.assert_array_equal(recording.stamps_ns(path.stem), np.arange(12) * 40_000_000)
+
+
+def test_tables_of_different_clocks_are_told_by_file(two: list[Path], warnings: list[str]) -> None:
+    for name, start_ns in (("left", 0), ("right", 1_700_000_000 * 10**9)):
+        rows = "".join(f"{start_ns + 40_000_000 * i}\n" for i in range(12))
+        (two[0].parent / f"{name}.csv").write_text("timestamp_ns\n" + rows)
+    open_recordings(two, OPTIONS)
+    (sentence,) = warnings
+    assert sentence.startswith(f"{two[0]} lasts from 0.000 s to 0.440 s, but {two[1]} lasts from 2023-11-14")
 
 
 def test_tables_of_times_tell_the_clock(two: list[Path]) -> None:

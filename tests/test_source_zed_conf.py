@@ -14,7 +14,7 @@ from aruco.errors import InputError
 from aruco.lens import project
 from aruco.pose_math import transform_points
 from rigcal.sources import zed_conf
-from rigcal.sources.zed_conf import factory_calibration, find_conf
+from rigcal.sources.zed_conf import factory_calibration, find_conf, require_one_camera
 
 # The HD720 numbers of a real camera (serial 1010, published by Toby Breckon under the MIT licence).
 REAL = """[LEFT_CAM_HD]
@@ -238,6 +238,15 @@ def test_a_file_without_a_serial_number_is_taken_and_told(tmp_path: Path, warned
     path = _written(tmp_path, conf_text(), "mine.conf")
     assert find_conf("1010", path, tmp_path / "other") == path
     assert any("does not say whose" in line for line in warned)
+
+
+def test_a_file_without_a_serial_number_is_not_that_of_two_cameras(tmp_path: Path) -> None:
+    path = _written(tmp_path, conf_text(), "mine.conf")
+    require_one_camera(path, ["1010", "1010"])
+    with pytest.raises(InputError, match=r"mine\.conf: does not say whose .* cannot be that of cameras 1010, 222 all"):
+        require_one_camera(path, ["222", "1010"])
+    require_one_camera(tmp_path, ["1010", "222"])
+    require_one_camera(_written(tmp_path, conf_text()), ["1010", "222"])  # find_conf has looked for the other one's
 
 
 def test_no_file_names_the_option_and_where_to_get_it(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from aruco.model import BadFrame, Frame, KnowsUp
 from aruco.pose_math import Array
 from rigcal.sources import zed_sdk
 from rigcal.sources.options import SourceOptions
+from rigcal.sources.zed_player import RefusedError
 
 FIRST_NS, PERIOD_NS = 1_700_000_000_000_000_000, 33_333_333
 NAME = "34563472"
@@ -172,6 +173,23 @@ def test_a_jump_that_misses_gives_the_right_frame_all_the_same(opening: Opening,
     assert sdk.open_now == 0
 
 
+@pytest.mark.parametrize("missed", [0, 3, 20])
+def test_on_the_way_to_a_frame_hardly_any_depth_is_computed(opening: Opening, missed: int) -> None:
+    """Whether jumps land or miss by a few or by many frames; from 64 before it, all would be 65."""
+    svo = svo_of(300, seek_error=missed)
+    recording, sdk = opening(svo)
+    (frame,) = recording.frames(NAME, [150], depth=True)
+    assert isinstance(frame, Frame)
+    assert frame.depth_m is not None
+    assert np.array_equal(frame.depth_m[1:], depth_m(svo, 150)[1:])
+    # Of three searches at most: 3 frames beyond the place at the first, 4 before and 3 beyond at the two others.
+    assert sdk.depths <= 4 + 8 + 8
+    sdk.depths = 0
+    (frame,) = recording.frames(NAME, [250], depth=True)
+    assert isinstance(frame, Frame)
+    assert sdk.depths == 1
+
+
 def test_a_frame_that_never_comes_again_is_bad(opening: Opening) -> None:
     svo = svo_of(300)
     recording, _ = opening(svo)
@@ -301,8 +319,15 @@ def test_up_is_what_the_accelerometer_measures_turned_into_the_camera(opening: O
 
 @pytest.mark.parametrize(
     "accelerations",
-    [None, [(0.0, 0.0, 0.0)] * 12, [(0.0, -5.0, 0.0)] * 12, [(float("nan"), 0.0, 0.0)] * 12],
-    ids=["no sensor", "not recorded", "not gravity", "not a number"],
+    [
+        None,
+        [(0.0, 0.0, 0.0)] * 12,
+        [(0.0, -5.0, 0.0)] * 12,
+        [(float("nan"), 0.0, 0.0)] * 12,
+        [(6.0 * (-1) ** k, -9.8, 1.0) for k in range(12)],
+        [(0.0, -9.8, 0.0)] * 4 + [(float("nan"), 0.0, 0.0)] * 8,
+    ],
+    ids=["no sensor", "not recorded", "not gravity", "not a number", "carried about", "too few"],
 )
 def test_up_is_unknown_where_gravity_was_not_measured(opening: Opening, accelerations: Any) -> None:
     recording, _ = opening(svo_of(12, accelerations=accelerations))
@@ -336,7 +361,7 @@ def test_an_unknown_depth_mode_is_answered_with_what_the_sdk_offers(opening: Ope
     ],
 )
 def test_a_file_that_the_sdk_refuses_gets_its_reason_and_a_cure(opening: Opening, code: ERROR_CODE, cure: str) -> None:
-    with pytest.raises(InputError, match=rf"a\.svo: the ZED SDK cannot open it \({code.name}\); .*{cure}"):
+    with pytest.raises(RefusedError, match=rf"a\.svo: the ZED SDK cannot open it \({code.name}\); .*{cure}"):
         opening(svo_of(refused=code))
 
 
@@ -420,18 +445,32 @@ def test_without_the_sdk_svo2_is_left_to_its_own_reader(tmp_path: Path) -> None:
         assert not zed_sdk.recognises(tmp_path / name, zed_sdk.MCAP_MAGIC)
 
 
-def test_an_sdk_that_cannot_be_loaded_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def _broken_sdk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    for name in ("pyzed", "pyzed.sl"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
     package = tmp_path / "site" / "pyzed"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
     (package / "sl.py").write_text("raise ImportError('libsl_zed.so: cannot open shared object file')")
     monkeypatch.syspath_prepend(package.parent)
+    yield
+    # Popped before monkeypatch puts back what was there: its delitem would put the broken one back.
+    for name in ("pyzed", "pyzed.sl"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.usefixtures("_broken_sdk")
+def test_an_sdk_that_cannot_be_loaded_says_why(tmp_path: Path) -> None:
     path = tmp_path / "a.svo"
     path.write_bytes(b"SVO")
     assert not zed_sdk.is_available()
     with pytest.raises(InputError, match=r"cannot be loaded \(libsl_zed\.so: cannot open shared object file\)"):
         zed_sdk.opened(path, SourceOptions())
-    monkeypatch.delitem(sys.modules, "pyzed", raising=False)
+
+
+def test_a_broken_sdk_is_not_left_to_the_tests_that_follow() -> None:
+    assert "pyzed" not in sys.modules or zed_sdk.is_available()
 
 
 def test_the_reader_itself_is_imported_without_the_sdk() -> None:

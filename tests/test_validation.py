@@ -323,3 +323,7 @@ def test_cameras_under_the_floor_are_told() -> None:
     quality = quality_of(outcome.validation, below_target_m=mirrored)
     assert quality.verdict != "good"
     assert "upside down or mirrored" in told(quality)
+    assert "--ground-face" in told(quality)
+    by_imu = quality_of(outcome.validation, below_target_m=mirrored, up_by_imu=True)
+    assert "--ground-face" not in told(by_imu)
+    assert "--up-from target" in told(by_imu)

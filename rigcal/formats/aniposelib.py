@@ -10,6 +10,7 @@ all of them ``rotation`` (Rodrigues) and ``translation`` map the world into the 
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -27,8 +28,6 @@ from rigcal.formats.rig import (
     ExportOptions,
     Format,
     Rig,
-    check_cameras,
-    check_name,
     listed,
     pinhole_of,
     refuse_distortion,
@@ -36,17 +35,30 @@ from rigcal.formats.rig import (
 from rigcal.formats.rotations import nearest_rotation, words
 
 WHAT = "a camera file of aniposelib or caliscope (TOML)"
-MAX_FILE_BYTES = 16 * 2**20  # caliscope keeps points in older ones
+MAX_FILE_BYTES = 2**20
+# A camera's keys have three parts; tomllib's time and memory grow with the square of their number.
+MAX_KEY_PARTS = 16
+# Texts and comments are passed over as wholes; what follows a quote without an end is no TOML anyway.
+_TOKEN = re.compile(
+    r"""
+    (?P<text> \"{3}(?:[^\\]|\\.)*?\"{3,5} | '{3}.*?'{3,5} | "(?:[^"\\\n]|\\.)*" | '[^'\n]*' )
+  | (?P<rest> ["'].* )
+  | (?P<comment> \#[^\n]* )
+  | (?P<dot> [ \t]*\.[ \t]* )
+  | (?P<word> [A-Za-z0-9_-]+ )
+  | (?P<other> [ \t]+ | . )
+    """,
+    re.VERBOSE | re.DOTALL,
+)
 
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     """Write a table a camera, in the order of their names.
 
     Raises:
-        InputError: Intrinsics are not known, or a lens has more than five coefficients.
+        InputError: A lens has more than five coefficients.
         OutputError: The file cannot be written.
     """
-    check_cameras(rig, "aniposelib")
     digits = len(str(len(rig.T_world_cam) - 1))  # aniposelib sorts tables by their names as words
     tables = [
         _table(f"cam_{index:0{digits}d}", T, rig.cameras[n]) for index, (n, T) in enumerate(rig.T_world_cam.items())
@@ -57,7 +69,6 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
 
 
 def _table(key: str, T_world_cam: Pose, camera: Camera) -> str:
-    check_name(camera.name, "aniposelib")
     pinhole_of(camera, "aniposelib")
     fisheye = camera.distortion_model == "equidistant"
     if not fisheye and any(camera.distortion[5:]):
@@ -112,12 +123,26 @@ def read_cameras(path: Path) -> Mapping[str, Camera]:
 
 def _parsed(path: Path) -> dict[str, Any]:
     text = read_text(path, WHAT, MAX_FILE_BYTES)
+    if (parts := _most_key_parts(text)) > MAX_KEY_PARTS:
+        raise InputError(f"{path}: has a key of {parts} parts, parted by dots; give {WHAT}.")
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: not readable as TOML ({' '.join(str(error).split())[:200]}); give {WHAT}."
         ) from error
+
+
+def _most_key_parts(text: str) -> int:
+    """The largest number of words that dots join."""
+    most = dots = 0
+    for found in _TOKEN.finditer(text):
+        if found.lastgroup == "dot":
+            dots += 1
+            most = max(most, dots)
+        elif found.lastgroup not in ("word", "text"):
+            dots = 0
+    return most + 1
 
 
 def _tables(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
@@ -193,7 +218,7 @@ FORMAT = Format(
         "world to camera, the inverse of T_world_cam, OpenCV camera axes, the calibration's own world; matrix, "
         "distortions and size as OpenCV has them; foreign files are taken to be in metres."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     read_cameras=read_cameras,

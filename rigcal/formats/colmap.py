@@ -22,7 +22,7 @@ from aruco.pose_math import Pose, invert_transform, make_pose, pose_distance
 from rigcal.formats.colmap_lens import camera_of_model, colmap_model
 from rigcal.formats.image_names import image_name
 from rigcal.formats.reading import number, read_text, whole
-from rigcal.formats.rig import CAMERA_WORD, ExportOptions, Format, Rig, check_cameras, check_name, filled
+from rigcal.formats.rig import CAMERA_WORD, ExportOptions, Format, Rig, check_name, filled
 from rigcal.formats.rotations import rotation_of_xyzw, words, xyzw_of_rotation
 from rigcal.formats.whole_folder import write_folder
 
@@ -35,9 +35,8 @@ SAME_M, SAME_RAD = 1e-6, 1e-6
 
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
-    """Write the model; see Format.write."""
-    check_cameras(rig, NAME)
-    pattern = options.image_name if options.image_name != ExportOptions().image_name else DEFAULT_PATTERN
+    """Write the model; see Format.write, which has checked the rig."""
+    pattern = options.image_name or DEFAULT_PATTERN
     prefix = _prefix(pattern)
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
@@ -67,7 +66,7 @@ def _prefix(pattern: str) -> str:
     """
     at = pattern.find(f"{CAMERA_WORD}/")
     prefix = pattern[: at + len(CAMERA_WORD) + 1]
-    if at < 0 or CAMERA_WORD in pattern[len(prefix) :]:
+    if at < 0 or pattern[:at].rpartition("/")[2] or CAMERA_WORD in pattern[len(prefix) :]:
         raise InputError(
             f"--image-name {pattern!r}: COLMAP finds a camera's images by their folder and the images of one moment by "
             f"the rest of their names; give one like {DEFAULT_PATTERN}."
@@ -105,16 +104,20 @@ def read(path: Path) -> Rig:
     prefixes = _prefixes(path / RIG)
     poses: dict[str, Pose] = {}
     cameras: dict[str, Camera] = {}
+    first: dict[str, str] = {}
     for where, image, camera_id, T_cam_world in _image_lines(path / IMAGES):
         name, T_world_cam = _camera_name(image, prefixes, where), invert_transform(T_cam_world)
         if name in poses and not _same(poses[name], T_world_cam):
             raise InputError(
-                f"{where}: images of camera {name} stand in different places; only a rig at rest can be read."
+                f"{where}: {first[name][:80]!r} and {image[:80]!r} stand in different places and are both taken for "
+                f"camera {name}, by the last folder of their names; give every camera a folder of its own, and one "
+                "moment only."
             )
         if camera_id not in lenses:
             raise InputError(f"{where}: camera {camera_id} is not in {CAMERAS}.")
         line, width, height, model, parameters = lenses[camera_id]
         poses[name] = T_world_cam
+        first.setdefault(name, image)
         cameras[name] = camera_of_model(name, model, width, height, parameters, line)
     if not poses:
         raise InputError(f"{path / IMAGES}: holds no image; give {WHAT}.")
@@ -195,7 +198,7 @@ FORMAT = Format(
         "principal points count from the pixel's corner (ours + 0.5); the calibration's world is kept; rig_config.json "
         "holds the rig in the frame of its first camera, whose images are found by their folder."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     needs_cameras=True,

@@ -26,8 +26,6 @@ from rigcal.formats.rig import (
     ExportOptions,
     Format,
     Rig,
-    check_cameras,
-    check_name,
     numbered_name,
     pinhole_of,
     refuse_distortion,
@@ -49,14 +47,12 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     """Write the cameras in the order of their names.
 
     Raises:
-        InputError: Intrinsics are not known, or Kalibr has no such lens.
+        InputError: Kalibr has no such lens.
         OutputError: The file cannot be written.
     """
-    check_cameras(rig, "kalibr")
     chain: dict[str, Any] = {}
     before: Pose | None = None
     for index, (name, T_world_cam) in enumerate(rig.T_world_cam.items()):
-        check_name(name, out)
         T_cam_world = invert_transform(T_world_cam)
         relative = {} if before is None else {"T_cn_cnm1": steady(T_cam_world @ before).tolist()}
         chain[numbered_name(index)] = {**relative, **_intrinsics(rig.cameras[name])}
@@ -168,7 +164,7 @@ FORMAT = Format(
         "right, y down, z forward); cameras are cam0, cam1, ... in the order of their names, which stand in rostopic "
         "/<name>/image_raw; the world is lost: read back, it is the first camera's frame, and up is unknown."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     read_cameras=read_cameras,

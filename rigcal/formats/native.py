@@ -116,11 +116,15 @@ def read_json_and_digest(path: Path) -> tuple[dict[str, Any], str]:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"{path}: over {MAX_FILE_BYTES >> 20} MiB, which is not an extrinsics file.")
         raw = path.read_bytes()
-        content = json.loads(raw.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
+        content = json.loads(
+            raw.decode("utf-8"), parse_constant=_finite, parse_float=_finite, object_pairs_hook=_untwinned
+        )
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
     except _NoNumberError as error:
         raise InputError(f"{path}: {_place_of(raw)}: {error}; mend or remove it.") from error
+    except _TwinsError as error:
+        raise InputError(f"{path}: {error} is there twice in one object; rename or remove one of them.") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON file ({error}); give an extrinsics file.") from error
     if not isinstance(content, dict):
@@ -138,6 +142,20 @@ def _finite(text: str) -> float:
 
 class _NoNumberError(ValueError):
     """NaN, or what is like it."""
+
+
+def _untwinned(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of which no member would silently be lost."""
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise _TwinsError(repr(key[:80]))
+        found[key] = value
+    return found
+
+
+class _TwinsError(ValueError):
+    """Two members of one name."""
 
 
 def _place_of(raw: bytes) -> str:

@@ -135,7 +135,7 @@ FORMAT = Format(
         "right, y down, z forward); _meta.world.up says which way is up; intrinsics stand beside the pose; figures of "
         "quality and covariances are not carried over."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     read_cameras=read_cameras,

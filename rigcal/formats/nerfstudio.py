@@ -23,12 +23,11 @@ from aruco.model import Camera, DistortionModel, UpAxis
 from aruco.pose_math import Array, Pose
 from rigcal.formats.image_names import image_name
 from rigcal.formats.native import read_json, write_json
-from rigcal.formats.reading import matrix, number, whole
+from rigcal.formats.reading import matrix, number, whole, word
 from rigcal.formats.rig import (
     ExportOptions,
     Format,
     Rig,
-    check_cameras,
     check_name,
     pinhole_of,
     refuse_distortion,
@@ -40,6 +39,7 @@ from rigcal.formats.rig import (
 from rigcal.formats.rotations import nearest_rotation, rigid_pose, steady
 
 NAME = "nerfstudio"
+DEFAULT_PATTERN = "{camera}.png"
 HALF_PIXEL = 0.5
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # nerfstudio's names of the coefficients, in OpenCV's order.
@@ -59,11 +59,10 @@ _MODELS: Mapping[str, DistortionModel] = {
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     """Write the file; see Format.write."""
-    check_cameras(rig, NAME)
     poses = {name: z_up(T) @ _OPENGL for name, T in y_up(rig, NAME).items()}
     frames = [
         {
-            "file_path": image_name(options.image_name, name, NAME),
+            "file_path": image_name(options.image_name or DEFAULT_PATTERN, name, NAME),
             "camera_name": name,
             **_intrinsics(rig.cameras[name]),
             "transform_matrix": steady(T).tolist(),
@@ -178,7 +177,7 @@ def _camera(name: str, keys: Mapping[str, Any], where: str) -> Camera | None:
     """The lens of a frame, whose keys count where the file's root has none; None where no focal length is given."""
     if "fl_x" not in keys:
         return None
-    model = keys.get("camera_model", "OPENCV")
+    model = word(keys.get("camera_model", "OPENCV"))
     if model not in _MODELS:
         raise InputError(f"{where}: camera_model {model!r} has no counterpart here; known: {', '.join(_MODELS)}.")
     kind = _MODELS[model]
@@ -211,7 +210,7 @@ FORMAT = Format(
         "(x, y, z) -> (x, -z, y) of the +Y-up world, as applied_transform says; intrinsics in every frame, "
         "principal points from the pixel's corner (ours + 0.5); file_path is relative to the file."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     needs_up=True,

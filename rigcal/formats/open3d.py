@@ -24,7 +24,6 @@ from rigcal.formats.rig import (
     ExportOptions,
     Format,
     Rig,
-    check_cameras,
     listed,
     numbered_name,
     pinhole_of,
@@ -39,10 +38,9 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     """Write the cameras in the order of their names.
 
     Raises:
-        InputError: Intrinsics are not known.
+        InputError: A camera matrix has skew.
         OutputError: The file cannot be written.
     """
-    check_cameras(rig, "open3d")
     if bent := [name for name, camera in rig.cameras.items() if camera.has_distortion]:
         logger.warning(
             "open3d has no place for lens distortion, and camera {} has some: its intrinsics hold for images that were "
@@ -134,7 +132,7 @@ FORMAT = Format(
         "intrinsic_matrix is column by column too; no distortion: undistort images first; names stand in a member that "
         "Open3D ignores."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     read_cameras=read_cameras,

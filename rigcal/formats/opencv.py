@@ -20,16 +20,14 @@ from aruco.atomic import write_whole
 from aruco.errors import InputError
 from aruco.model import Camera
 from aruco.pose_math import Array, Pose, invert_transform, matrix_to_rvec_tvec, rvec_tvec_to_matrix
-from rigcal.formats.reading import MAX_YAML_BYTES, numbers, placed, read_text, whole, word, yaml_mapping
+from rigcal.formats.reading import MAX_YAML_BYTES, numbers, parsed_xml, placed, read_text, whole, word, yaml_mapping
 from rigcal.formats.rig import (
     UP_WORDS,
     ExportOptions,
     Format,
     Rig,
-    check_name,
     pinhole_of,
 )
-from rigcal.formats.ros_frames import parsed_xml
 from rigcal.formats.rotations import rigid_pose, steady
 
 WHAT = "a YAML or XML file of OpenCV's FileStorage"
@@ -54,7 +52,7 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
         storage.write("world_up", rig.up)
     storage.startWriteStruct("cameras", cv2.FileNode_SEQ)
     for name, T_world_cam in rig.T_world_cam.items():
-        check_name(name, out)
+        _check_text(name, out)
         storage.startWriteStruct("", cv2.FileNode_MAP)
         storage.write("name", name)
         if name in rig.cameras:
@@ -65,6 +63,14 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
         storage.endWriteStruct()
     storage.endWriteStruct()
     write_whole(out, storage.releaseAndGetString().encode())
+
+
+def _check_text(name: str, out: Path) -> None:
+    if "'" in name or name != name.strip(' "'):  # cv2 writes them without the quotes that YAML wants
+        raise InputError(
+            f"{out}: opencv cannot hold the name {name[:80]!r}, with an apostrophe, or a blank or a quote at its edge; "
+            "rename the camera."
+        )
 
 
 def _write_lens(storage: Any, camera: Camera) -> None:
@@ -107,15 +113,15 @@ def read_cameras(path: Path) -> Mapping[str, Camera]:
 def _parsed(path: Path) -> dict[str, Any]:
     text = read_text(path, WHAT, MAX_YAML_BYTES)
     if text.lstrip().startswith("<"):
-        return _of_xml(path)
+        return _of_xml(text, path)
     # The directive is no YAML: %YAML:1.0 instead of %YAML 1.0.
     head, _, rest = text.partition("\n")
     return yaml_mapping(rest if head.startswith("%YAML") else text, path, WHAT)
 
 
-def _of_xml(path: Path) -> dict[str, Any]:
+def _of_xml(text: str, path: Path) -> dict[str, Any]:
     """The same maps as YAML gives; only the maps of maps that a single calibration has."""
-    _, root = parsed_xml(path, WHAT)
+    root = parsed_xml(text, path, WHAT)
     return {
         node.tag: {part.tag: (part.text or "").split() if part.tag == "data" else (part.text or "") for part in node}
         if len(node)
@@ -201,7 +207,7 @@ FORMAT = Format(
         "camera_matrix, distortion_coefficients and image size; camera axes x right, y down, z forward, the "
         "calibration's own world; equidistant lenses want cv2.fisheye."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     read_cameras=read_cameras,

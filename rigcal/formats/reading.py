@@ -1,6 +1,7 @@
 """Reading other people's text files without trusting them.
 
-Owns      a limit on size, UTF-8, the safe subset of YAML, numbers in words; the sentence for each thing that is wrong.
+Owns      a limit on size, UTF-8, the safe subset of YAML and XML, numbers in words; the sentence for each
+          thing that is wrong.
 Leaves    what the content means to each format.
 """
 
@@ -11,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import yaml
@@ -55,18 +57,49 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
     return yaml_mapping(read_text(path, what, MAX_YAML_BYTES), path, what)
 
 
+class _TwinsError(ValueError):
+    """Two keys of one name, of which YAML's parser would silently lose one."""
+
+
+class _Loader(yaml.BaseLoader):
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise _TwinsError(f"line {key.start_mark.line + 1}: {key.value[:80]!r} is there twice")
+                seen.add(key.value)
+        return super().construct_mapping(node, deep=deep)
+
+
 def yaml_mapping(text: str, path: Path, what: str) -> dict[str, Any]:
     """The same, of the text of a file that was read."""
     try:
         # The base loader makes no objects: safer than the safe one, and YAML 1.1's idea that 1e-05 is a word and
         # 010 is eight does not matter.
-        content = yaml.load(text, Loader=yaml.BaseLoader)
+        content = yaml.load(text, Loader=_Loader)
+    except _TwinsError as error:
+        raise InputError(f"{path}: {error}; rename or remove one of them.") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not readable as YAML ({reason}); give {what}.") from error
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise InputError(f"{path}: holds no keys; give {what}.")
     return content
+
+
+def parsed_xml(text: str, path: Path, what: str) -> ElementTree.Element:
+    """The root of an XML file's text; document types and entities, which can swell without end, are refused.
+
+    Raises:
+        InputError: It is no XML, or has a document type.
+    """
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(f"{path}: has a DOCTYPE or ENTITY, which is not read; remove it, {what} needs none.")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path}: not readable as XML ({error}); give {what}.") from error
 
 
 @contextmanager

@@ -55,13 +55,13 @@ class ExportOptions:
 
     parent_frame: str = "world"  # the frame that the poses are given in
     frame_name: str = "{camera}_left_camera_optical_frame"  # a camera's frame, with the word {camera}
-    image_name: str = "{camera}.png"  # a camera's image, with the word {camera}
+    image_name: str | None = None  # a camera's image, with the word {camera}; None: as the format has it
     into: Path | None = None  # a file of the format, of which only the poses are replaced
 
     def __post_init__(self) -> None:
         """Refuse patterns that give every camera the same name."""
         for option, pattern in (("--frame-name", self.frame_name), ("--image-name", self.image_name)):
-            if CAMERA_WORD not in pattern:
+            if pattern is not None and CAMERA_WORD not in pattern:
                 raise InputError(f"{option} {pattern!r}: lacks the word {CAMERA_WORD}, where the camera's name goes.")
 
 
@@ -77,8 +77,8 @@ class Format:
     name: str  # as given to --to
     suffix: str  # of the file that is written; "" for a folder
     explain: str  # one line: what the numbers mean: direction, axes, units, world, what is lost
-    # Write whole or not at all (rig, out, options); raises InputError for what it cannot hold, OutputError.
-    write: Callable[[Rig, Path, ExportOptions], None]
+    # The layout's part of write.
+    put: Callable[[Rig, Path, ExportOptions], None]
     # Read; raises InputError with a sentence that names the file.
     read: Callable[[Path], Rig]
     # By content: the path and its first 64 KiB (b"" for folders); cheap, never raises.
@@ -89,6 +89,21 @@ class Format:
     needs_cameras: bool = False  # writes no camera without intrinsics
     takes: frozenset[str] = frozenset()  # the fields of ExportOptions that it looks at
 
+    def write(self, rig: Rig, out: Path, options: ExportOptions) -> None:
+        """Write a rig whole or not at all.
+
+        Raises:
+            InputError: The format cannot hold it; the message says why and what to do.
+            OutputError: The output cannot be written.
+        """
+        for name in rig.T_world_cam:
+            check_name(name, out)
+        if self.needs_up:
+            check_up(rig, self.name)
+        if self.needs_cameras:
+            check_cameras(rig, self.name)
+        self.put(rig, out, options)
+
 
 def y_up(rig: Rig, who: str) -> dict[str, Pose]:
     """T_world_cam of every camera, in the rig's world turned so that its +Y points up.
@@ -96,11 +111,7 @@ def y_up(rig: Rig, who: str) -> dict[str, Pose]:
     Raises:
         InputError: Nobody knows which way is up; ``who`` is the format that wants to.
     """
-    if rig.up is None:
-        raise InputError(
-            f"{who} wants a world that stands upright, and this calibration does not say which way is up; calibrate "
-            "again with --auto-align."
-        )
+    check_up(rig, who)
     if rig.up == "+y":
         return dict(rig.T_world_cam)
     return {name: turned(_HALF_TURN_X, T) for name, T in rig.T_world_cam.items()}
@@ -119,6 +130,19 @@ def y_up_of_z_up(T_world_cam: Pose) -> Pose:
 def turned(R: Pose, T_world_cam: Pose) -> Pose:
     """A pose after its world's axes are turned by a (3, 3) rotation."""
     return make_pose(R @ T_world_cam[:3, :3], R @ T_world_cam[:3, 3])
+
+
+def check_up(rig: Rig, who: str) -> None:
+    """See that the rig's world says which way is up.
+
+    Raises:
+        InputError: It does not; ``who`` is the format that wants to know.
+    """
+    if rig.up is None:
+        raise InputError(
+            f"{who} wants a world that stands upright, and this calibration does not say which way is up; calibrate "
+            "again with --auto-align."
+        )
 
 
 def check_cameras(rig: Rig, who: str) -> None:
@@ -163,10 +187,12 @@ def check_name(name: str, where: object) -> None:
     Raises:
         InputError: It cannot; ``where`` is the file.
     """
-    if not name or name.startswith("_") or name in (".", "..") or any(ord(c) < 32 or c in "/\\\x7f" for c in name):
+    # Text of other programs breaks at signs that cannot be printed, and cv2 crashes at half a surrogate.
+    bad = not name.isprintable() or any(sign in name for sign in "/\\")
+    if bad or not name or name.startswith("_") or name in (".", ".."):
         raise InputError(
-            f"{where}: a camera cannot be called {name[:80]!r}: no slashes, no control characters, no _ in front; "
-            "rename it."
+            f"{where}: a camera cannot be called {name[:80]!r}: no slashes, only signs that can be printed, no _ in "
+            "front; rename it."
         )
 
 

@@ -21,9 +21,9 @@ import numpy as np
 from aruco.atomic import write_whole
 from aruco.errors import InputError
 from aruco.pose_math import Array, Pose, make_pose
-from rigcal.formats.reading import number, read_text
+from rigcal.formats.reading import number, parsed_xml, read_text
 from rigcal.formats.rig import ExportOptions, Format, Rig
-from rigcal.formats.ros_frames import MAX_FILE_BYTES, Link, frames_of, note, parsed_xml, rig_of, upright
+from rigcal.formats.ros_frames import MAX_FILE_BYTES, Link, frames_of, note, rig_of, upright
 from rigcal.formats.rotations import nearest_rotation, rotation_of_rpy, rotation_of_xyzw, words, xyzw_of_rotation
 
 NAME = "ros2-launch"
@@ -61,7 +61,7 @@ def read(path: Path) -> Rig:
         InputError: It cannot be read, or its transforms are not literal; the message names the file.
     """
     text = read_text(path, _WHAT, MAX_FILE_BYTES)
-    publishers = _in_xml(path) if text.lstrip().startswith("<") else _in_python(text, path)
+    publishers = _in_xml(text, path) if text.lstrip().startswith("<") else _in_python(text, path)
     links: dict[str, Link] = {}
     for nth, words_of_one in enumerate(publishers, start=1):
         parent, child, T_parent_child = _transform(words_of_one, f"{path}: {PROGRAM} {nth}")
@@ -127,8 +127,8 @@ def _xml(publishers: Mapping[str, Sequence[str]], about: Sequence[str]) -> str:
     return ElementTree.tostring(launch, encoding="unicode") + "\n"
 
 
-def _in_xml(path: Path) -> Iterator[Sequence[str]]:
-    _, root = parsed_xml(path, _WHAT)
+def _in_xml(text: str, path: Path) -> Iterator[Sequence[str]]:
+    root = parsed_xml(text, path, _WHAT)
     for node in root.iter("node"):
         if node.get("exec", node.get("type")) == PROGRAM:
             try:
@@ -201,7 +201,7 @@ FORMAT = Format(
         "the pose of the camera's optical frame (x right, y down, z forward) in the parent frame, metres, quaternion "
         "xyzw, world Z up (REP-103); poses only."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     needs_up=True,

@@ -1,7 +1,7 @@
 """Frames of ROS: how cameras' names become names of frames and back, and poses from a tree of transforms.
 
 Owns      which names ROS takes, the reversible spelling of all others, the note in a file that says how its frames
-          are named, walking a tree of transforms, parsing XML without its dangers.
+          are named, walking a tree of transforms.
 Leaves    what a launch file and a URDF look like to their own files.
 
 The world is REP-103's, Z up; a camera's frame is optical: x right, y down, z forward.
@@ -13,18 +13,19 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 from loguru import logger
 
 from aruco.errors import InputError
 from aruco.pose_math import Pose
-from rigcal.formats.reading import read_text
 from rigcal.formats.rig import CAMERA_WORD, ExportOptions, Rig, filled, listed, y_up, y_up_of_z_up, z_up
 
 # A hall of a hundred cameras takes 100 kB.
-MAX_FILE_BYTES = 4 * 2**20
+MAX_FILE_BYTES = 2**20
+# No robot has an arm of more joints, no frame a longer name.
+MAX_DEPTH = 64
+MAX_NAME = 255
 _FRAME = re.compile("[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*")
 _NOTE = "Camera frames are named"
 _DEFAULT_PATTERNS = (ExportOptions().frame_name, "{camera}_optical_frame")
@@ -46,6 +47,8 @@ def frame_of(camera: str, pattern: str) -> str:
 
 def camera_of(frame: str, pattern: str) -> str | None:
     """The camera whose frame this is; None: the frame does not follow the pattern."""
+    if len(frame) > MAX_NAME:
+        return None
     first, second, *more = (re.escape(part) for part in pattern.split(CAMERA_WORD))
     found = re.fullmatch("".join([first, "(?P<camera>.+)", second, *("(?P=camera)" + part for part in more)]), frame)
     return re.sub("_x([0-9a-f]{1,6})_", _letter, found["camera"]) if found else None
@@ -110,7 +113,7 @@ def rig_of(links: Mapping[str, Link], text: str, path: Path) -> Rig:
 
 def _cameras(links: Mapping[str, Link], text: str, path: Path) -> dict[str, str]:
     """Camera -> frame: by the pattern that the file states, else by the usual endings, else all ends of the tree."""
-    stated = re.search(f"{_NOTE} ([A-Za-z0-9_/{{}}]+)", text)
+    stated = re.search(f"{_NOTE} ([A-Za-z0-9_/{{}}]{{1,{MAX_NAME}}})", text)
     for pattern in (stated.group(1),) if stated and CAMERA_WORD in stated.group(1) else _DEFAULT_PATTERNS:
         if found := {camera: frame for frame in links if (camera := camera_of(frame, pattern))}:
             return found
@@ -136,20 +139,7 @@ def _placed(frame: str, links: Mapping[str, Link], path: Path) -> tuple[str, Pos
         T_root_frame, at = link.T_parent_child @ T_root_frame, link.parent
         if at in seen:
             raise InputError(f"{path}: frame {frame} hangs in a circle of frames; mend its parents.")
+        if len(seen) > MAX_DEPTH:
+            raise InputError(f"{path}: frame {frame} hangs below more than {MAX_DEPTH} others; give a simpler tree.")
         seen.add(at)
     return at, T_root_frame
-
-
-def parsed_xml(path: Path, what: str) -> tuple[str, ElementTree.Element]:
-    """An XML file's text and root; document types and entities, which can swell without end, are refused.
-
-    Raises:
-        InputError: It cannot be read, is no XML, or has a document type.
-    """
-    text = read_text(path, what, MAX_FILE_BYTES)
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"{path}: has a DOCTYPE or ENTITY, which is not read; remove it, {what} needs none.")
-    try:
-        return text, ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path}: not readable as XML ({error}); give {what}.") from error

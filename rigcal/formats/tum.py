@@ -17,10 +17,11 @@ from aruco.errors import InputError
 from aruco.model import UpAxis
 from aruco.pose_math import Pose, make_pose
 from rigcal.formats.reading import numbers, read_text
-from rigcal.formats.rig import UP_WORDS, ExportOptions, Format, Rig, check_name, numbered_name
+from rigcal.formats.rig import UP_WORDS, ExportOptions, Format, Rig, numbered_name
 from rigcal.formats.rotations import rotation_of_xyzw, words, xyzw_of_rotation
 
 WHAT = "a TUM trajectory (timestamp tx ty tz qx qy qz qw)"
+MAX_FILE_BYTES = 2**20  # some thousand cameras
 _CAMERA = re.compile(r'#\s*camera:\s*(".*")\s*')
 _UP = re.compile(r"#\s*world_up:\s*([-+]y)\s*")
 
@@ -36,7 +37,6 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
         lines.append(f"# world_up: {rig.up}")
     lines.append("# timestamp tx ty tz qx qy qz qw")
     for index, (name, T) in enumerate(rig.T_world_cam.items()):
-        check_name(name, out)
         lines.append(f"# camera: {json.dumps(name, ensure_ascii=False)}")
         lines.append(" ".join([str(index), *words(T[:3, 3]), *words(xyzw_of_rotation(T[:3, :3]))]))
     write_whole(out, ("\n".join(lines) + "\n").encode())
@@ -51,7 +51,7 @@ def read(path: Path) -> Rig:
     poses: dict[str, Pose] = {}
     up: UpAxis | None = None
     name, unnamed = "", 0
-    for count, line in enumerate(read_text(path, WHAT).splitlines(), 1):
+    for count, line in enumerate(read_text(path, WHAT, MAX_FILE_BYTES).splitlines(), 1):
         text, where = line.strip(), f"{path}: line {count}"
         if found := _UP.fullmatch(text):
             up = UP_WORDS[found[1]]
@@ -87,7 +87,7 @@ def _name(comment: str) -> str:
 
 
 def _pose(text: str, where: str) -> Pose:
-    values = numbers(text.replace(",", " ").split(), where, 8)
+    values = numbers(text.split(), where, 8)
     return make_pose(rotation_of_xyzw(values[4:], where), values[1:4])
 
 
@@ -109,7 +109,7 @@ FORMAT = Format(
         "camera axes (x right, y down, z forward), the calibration's own world; one line a camera, the time stamp is "
         "its index, its name stands in the comment above; intrinsics are not kept."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
 )

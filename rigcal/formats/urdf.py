@@ -15,9 +15,9 @@ from xml.etree import ElementTree
 from aruco.atomic import write_whole
 from aruco.errors import InputError
 from aruco.pose_math import Pose, make_pose
-from rigcal.formats.reading import numbers
+from rigcal.formats.reading import numbers, parsed_xml, read_text
 from rigcal.formats.rig import ExportOptions, Format, Rig
-from rigcal.formats.ros_frames import Link, frames_of, note, parsed_xml, rig_of, upright
+from rigcal.formats.ros_frames import MAX_FILE_BYTES, Link, frames_of, note, rig_of, upright
 from rigcal.formats.rotations import nearest_rotation, rotation_of_rpy, rpy_of_rotation, words
 
 NAME = "urdf"
@@ -49,7 +49,8 @@ def read(path: Path) -> Rig:
     Raises:
         InputError: It cannot be read, or holds no cameras on fixed joints; the message names the file.
     """
-    text, robot = parsed_xml(path, _WHAT)
+    text = read_text(path, _WHAT, MAX_FILE_BYTES)
+    robot = parsed_xml(text, path, _WHAT)
     if robot.tag != "robot":
         raise InputError(f"{path}: its root is <{robot.tag[:40]}>, not <robot>; give {_WHAT}.")
     if "ros.org/wiki/xacro" in text:
@@ -105,7 +106,7 @@ FORMAT = Format(
         "the link's pose in the parent frame, metres, rpy about the fixed axes x, y, z [rad], world Z up (REP-103); "
         "poses only."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     needs_up=True,

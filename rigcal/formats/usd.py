@@ -27,7 +27,6 @@ from rigcal.formats.rig import (
     ExportOptions,
     Format,
     Rig,
-    check_cameras,
     check_name,
     listed,
     pinhole_of,
@@ -55,7 +54,8 @@ _SAME_PX = 1e-3
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     """Write the stage; see Format.write."""
-    check_cameras(rig, NAME)
+    if out.suffix not in (".usda", ".usd"):
+        raise InputError(f"{out}: is written as text, which USD knows by its name; name it like rig.usda.")
     if rig.up is None:
         poses = rig.T_world_cam
         logger.warning(
@@ -271,7 +271,7 @@ FORMAT = Format(
         "looking along -z), metres, the world's +Y up where the calibration knows up; focal length and apertures in "
         "tenths of a metre, apertures' offsets for the principal point; lens distortion only as customData."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     needs_cameras=True,

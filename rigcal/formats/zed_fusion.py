@@ -1,7 +1,6 @@
 """The ZED SDK's Fusion configuration: JSON, one entry a camera, keyed by its serial number.
 
-Owns      both layouts (SDK 5.x, written and read; SDK 4.x, read), putting poses into a file that is there, the poses
-          that the SDK gives for a file in each of its coordinate systems.
+Owns      both layouts (SDK 5.x, written and read; SDK 4.x, read), putting poses into a file that is there.
 Leaves    changing a text without touching the rest of it to json_edit.
 
 On disk always: metres, the SDK's IMAGE axes (x right, y down, z forward) for world and camera, camera to world, left
@@ -14,6 +13,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from loguru import logger
 
 from aruco.atomic import write_whole
 from aruco.errors import InputError
-from aruco.pose_math import Array, Pose, matrix_to_rvec_tvec, pose_text, rvec_tvec_to_matrix
+from aruco.pose_math import Pose, matrix_to_rvec_tvec, pose_text, rvec_tvec_to_matrix
 from rigcal.formats.json_edit import Edit, Span, before, edited, members
 from rigcal.formats.native import json_bytes
 from rigcal.formats.reading import number, numbers, read_text
@@ -33,15 +33,6 @@ from rigcal.formats.rotations import rigid_pose, steady, words
 NAME = "zed-fusion"
 # A world with y down from one with Y up, and back.
 T_DOWN_UP = np.diag([1.0, -1.0, -1.0, 1.0])
-# The SDK's coordinate systems: their axes in terms of the IMAGE axes.
-SYSTEMS: Mapping[str, Array] = {
-    "IMAGE": np.eye(3),
-    "LEFT_HANDED_Y_UP": np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, 1]]),
-    "RIGHT_HANDED_Y_UP": np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]),
-    "RIGHT_HANDED_Z_UP": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "LEFT_HANDED_Z_UP": np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]]),
-    "RIGHT_HANDED_Z_UP_X_FWD": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
-}
 # The key under which a camera has its pose: SDK 5.x, SDK 4.x.
 LAYOUTS = ("FusionConfiguration", "world")
 # The SDK holds a serial number in 32 bits; a number with zeros before it would not come back.
@@ -50,13 +41,6 @@ _MAX_SERIAL = 2**32 - 1
 # Below this angle a rotation vector and Euler angles in any order agree to 0.01 deg (half the angle squared).
 _SMALL_RAD = np.deg2rad(1.0)
 _WHAT = "a ZED Fusion configuration"
-
-
-def sdk_pose(T_disk: Pose, system: str) -> Pose:
-    """The pose that the SDK gives for one in a file, when it is told to use a coordinate system of SYSTEMS."""
-    M = np.eye(4)
-    M[:3, :3] = SYSTEMS[system]
-    return M @ T_disk @ M.T
 
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
@@ -147,7 +131,7 @@ def _parsed(path: Path) -> tuple[str, dict[str, Any]]:
         raise InputError(f"{path}: not readable as JSON ({str(error)[:200]}); give {_WHAT}.") from error
     if not names:
         raise InputError(f"{path}: holds no camera; give {_WHAT}.")
-    if twins := listed({name for name in names if names.count(name) > 1}):
+    if twins := listed(name for name, count in Counter(names).items() if count > 1):
         raise InputError(f"{path}: camera {twins} is there twice; remove one of them.")
     for serial, camera in content.items():
         if not _SERIAL.fullmatch(serial) or _layout(camera) is None:
@@ -249,7 +233,7 @@ FORMAT = Format(
         "world and camera x right, y down, z forward (a camera at height H has ty = -H), override_gravity true; poses "
         "only, cameras are named by their serial numbers."
     ),
-    write=write,
+    put=write,
     read=read,
     recognises=recognises,
     needs_up=True,

@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from loguru import logger
+
 from aruco.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ NEVER_RECORDINGS = frozenset(
 UNFINISHED_SUFFIX = ".part"
 # Its state, in a folder that a conversion was interrupted in; see rigcal.recording_conversion.
 STATE_FILE = "conversion.json"
+RGBD_FOLDER = "RGB-D folder"
 
 
 class _Reader(Protocol):
@@ -78,6 +81,10 @@ def _opened(found: Sequence[_Found], options: SourceOptions) -> list[tuple[Path,
     """Each recording with where it lies; all videos are one, because they may have one clock and one calibration."""
     videos = [one.path for one in found if one.kind == "video"]
     opened = [(one.path, _with_sdk_or_without(one, options)) for one in found if one.kind != "video"]
+    if options.stereo_depth:
+        _tell_of_sdk_depth([one.path for one in found if one.kind == "ZED" and _only_sdk_reads(one)])
+    if options.zed_conf is not None:
+        _refuse_one_conf_for_several(options.zed_conf, [recording for _, recording in opened])
     if videos:
         from rigcal.sources import video
 
@@ -87,13 +94,44 @@ def _opened(found: Sequence[_Found], options: SourceOptions) -> list[tuple[Path,
 
 
 def _with_sdk_or_without(found: _Found, options: SourceOptions) -> Recording:
-    """The SDK knows its own files best; depth by semi-global matching is only to be had without it."""
-    if found.kind == "ZED" and not options.stereo_depth:
-        from rigcal.sources import zed_sdk
+    """The SDK knows its own files best; depth by semi-global matching is only to be had without it.
 
-        if zed_sdk.is_available():
-            return zed_sdk.opened(found.path, options)
-    return found.reader.opened(found.path, options)
+    What it does not open, for want of a GPU or of a calibration that --zed-conf names, can be read all the same.
+    """
+    if found.kind != "ZED" or options.stereo_depth or _only_sdk_reads(found):
+        return found.reader.opened(found.path, options)
+    from rigcal.sources import zed_sdk
+    from rigcal.sources.zed_player import RefusedError
+
+    if not zed_sdk.is_available():
+        return found.reader.opened(found.path, options)
+    try:
+        return zed_sdk.opened(found.path, options)
+    except RefusedError as error:
+        logger.warning("{} It is read without the SDK, which gives no depth unless --stereo-depth asks for it", error)
+        return found.reader.opened(found.path, options)
+
+
+def _only_sdk_reads(found: _Found) -> bool:
+    from rigcal.sources import zed_sdk
+
+    return found.reader is zed_sdk
+
+
+def _tell_of_sdk_depth(paths: Sequence[Path]) -> None:
+    if paths:
+        logger.warning(
+            "--stereo-depth: {} only the ZED SDK reads, so its own depth is used there", ", ".join(map(str, paths))
+        )
+
+
+def _refuse_one_conf_for_several(conf: Path, recordings: Sequence[Recording]) -> None:
+    """A calibration that does not say whose it is cannot be that of two cameras."""
+    from rigcal.sources.svo2 import Svo2
+    from rigcal.sources.zed_conf import require_one_camera
+
+    own = [recording for recording in recordings if isinstance(recording, Svo2)]
+    require_one_camera(conf, [camera.name for recording in own for camera in recording.cameras])
 
 
 def _found(path: Path) -> list[_Found]:
@@ -116,21 +154,45 @@ def _found(path: Path) -> list[_Found]:
 
 def _in_folder(path: Path) -> list[_Found]:
     whole = _folder(path)
-    if whole is not None:
+    if whole is not None and whole.kind != RGBD_FOLDER:
         return [whole]
-    inside = list(_children(path))
+    inside = list(_children(path, but_images=whole is not None))
+    if whole is not None:
+        inside = [whole, *(one for one in inside if one.kind != RGBD_FOLDER)]
     kinds = sorted({one.kind for one in inside})
     if len(kinds) > 1:
         examples = ", ".join(f"{next(o.path.name for o in inside if o.kind == k)} ({k})" for k in kinds)
         raise InputError(f"{path}: holds recordings of several kinds, {examples}; give those that are meant by name.")
     if inside:
+        _tell_left_out(path, inside)
         return inside
+    from rigcal.sources.rgbd_folder import is_without_images
     from rigcal.sources.unknown import RECORDING_SUFFIXES, empty_folder, unknown_file
 
     for child in _considered(path):
         if child.suffix.lower() in RECORDING_SUFFIXES and child.is_file():
             raise unknown_file(child, _head(child))
+    if is_without_images(path):  # its reader says what it lacks
+        return [_Found(path, RGBD_FOLDER, _RgbdFolders())]
     raise empty_folder(path)
+
+
+def _tell_left_out(path: Path, inside: Sequence[_Found]) -> None:
+    """Name what looks like one more camera and is none."""
+    from rigcal.sources.rgbd_folder import is_without_images
+    from rigcal.sources.unknown import RECORDING_SUFFIXES, why_left_out
+
+    used = {one.path for one in inside}
+    for child in _considered(path):
+        if child in used:
+            continue
+        if child.is_dir():
+            # Beside videos these are their intrinsics; a camera of the folder itself stays one of it.
+            if inside[0].kind == RGBD_FOLDER and path not in used and is_without_images(child):
+                logger.warning("{}: is left out: it has camera_info.yaml but no image", child)
+        elif child.suffix.lower() in RECORDING_SUFFIXES:
+            why = why_left_out(child, _head(child)) if child.is_file() else "is no file that could be read"
+            logger.warning("{}: is left out: {}", child, why)
 
 
 def _considered(path: Path) -> Iterator[Path]:
@@ -139,8 +201,10 @@ def _considered(path: Path) -> Iterator[Path]:
             yield child
 
 
-def _children(path: Path) -> Iterator[_Found]:
+def _children(path: Path, *, but_images: bool = False) -> Iterator[_Found]:
     for child in _considered(path):
+        if but_images and child.name in ("image", "depth", "confidence"):  # many files, none of them a recording
+            continue
         one = _folder(child) if child.is_dir() else _file(child) if child.is_file() else None
         if one is not None:
             yield one
@@ -150,7 +214,7 @@ def _folder(path: Path) -> _Found | None:
     from rigcal.sources import rgbd_folder
 
     if rgbd_folder.is_rgbd_folder(path):
-        return _Found(path, "RGB-D folder", _RgbdFolders())
+        return _Found(path, RGBD_FOLDER, _RgbdFolders())
     from rigcal.sources import ros_bag
 
     return _Found(path, "ROS bag", ros_bag) if ros_bag.recognises(path, b"") else None
@@ -172,7 +236,11 @@ class _RgbdFolders:
 
 def _file(path: Path) -> _Found | None:
     """The first reader that knows what the file holds, if one does."""
+    from rigcal.sources.unknown import is_text
+
     head = _head(path)
+    if path.suffix.lower() in (".svo", ".svo2") and is_text(head):  # the SDK would be asked for whatever is named so
+        return None
     for kind, reader in _file_readers():
         if reader.recognises(path, head):
             return _Found(path, kind, reader)

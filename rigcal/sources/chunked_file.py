@@ -186,8 +186,9 @@ class ChunkedFile:
 
     def contents(self, file: IO[bytes], number: int) -> memoryview:
         """A chunk's contents; raises DamagedError, and warns once, where they are lost."""
-        if self._cached is not None and self._cached[0] == number:
-            return self._cached[1]
+        cached = self._cached  # read once: another thread may forget it
+        if cached is not None and cached[0] == number:
+            return cached[1]
         if number in self._lost:
             raise DamagedError("lies in a damaged chunk")
         self._cached = None

@@ -144,7 +144,9 @@ class PacketDecoder:
         context.options = {"max_pixels": str(MAX_PIXELS), **options}
 
     def _send(self, context: av.VideoCodecContext, number: int, data: bytes, run: _Run) -> None:
-        packet = self._av.Packet(data)
+        # Not Packet(data): its bytes have no zeros behind them, and MPEG-4 Part 2 decoders read what lies there.
+        packet = self._av.Packet(len(data))
+        packet.update(data)
         packet.pts = packet.dts = number
         self.n_decoded += 1
         trouble = self._take(context, packet, run)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from loguru import logger
@@ -25,15 +25,22 @@ NEAR_NS = 1_000_000_000
 FIRST_DATE_NS = 10**9 * 365 * 86400
 
 
+@runtime_checkable
+class HasFiles(Protocol):
+    """A recording whose cameras each have a file, and a clock, of their own."""
+
+    def file_of(self, camera: str) -> Path:
+        """The file that a camera's frames are in."""
+        ...
+
+
 def joined(opened: Sequence[tuple[Path, Recording]]) -> Recording:
     """The cameras of all recordings, each given with where it lies.
 
     Raises:
         InputError: Two of them have a camera of one name.
     """
-    if len(opened) == 1:
-        return opened[0][1]
-    recording = JoinedRecording(opened)
+    recording = opened[0][1] if len(opened) == 1 else JoinedRecording(opened)
     for sentence in disagreeing_clocks(opened):
         logger.warning(sentence)
     return recording
@@ -101,8 +108,11 @@ class _Span(NamedTuple):
 
 
 def disagreeing_clocks(opened: Sequence[tuple[Path, Recording]]) -> Iterator[str]:
-    """A sentence for every recording that begins after all earlier ones have ended: they cannot have one clock."""
-    spans = sorted(span for path, recording in opened if (span := _span(path, recording)) is not None)
+    """A sentence for every recording that begins after all earlier ones have ended: they cannot have one clock.
+
+    Of a recording that has a file for each camera, each file counts for itself.
+    """
+    spans = sorted(span for path, recording in opened for span in _spans(path, recording))
     if not spans:
         return
     latest = spans[0]
@@ -115,11 +125,12 @@ def disagreeing_clocks(opened: Sequence[tuple[Path, Recording]]) -> Iterator[str
         latest = max(latest, span, key=lambda one: one.end_ns)
 
 
-def _span(path: Path, recording: Recording) -> _Span | None:
-    stamps = [s for camera in recording.cameras if len(s := recording.stamps_ns(camera.name))]
-    if not stamps:
-        return None
-    return _Span(min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps), path)
+def _spans(path: Path, recording: Recording) -> Iterator[_Span]:
+    stamps = {camera.name: s for camera in recording.cameras if len(s := recording.stamps_ns(camera.name))}
+    if isinstance(recording, HasFiles):
+        yield from (_Span(int(s[0]), int(s[-1]), recording.file_of(name)) for name, s in stamps.items())
+    elif stamps:
+        yield _Span(min(int(s[0]) for s in stamps.values()), max(int(s[-1]) for s in stamps.values()), path)
 
 
 def _moment(stamp_ns: int) -> str:

@@ -187,6 +187,21 @@ class GrowingMcap:
         self._end = at
 
 
+def has_chunk(path: Path) -> bool:
+    """Whether a file that was begun holds a chunk with its index."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        at = len(MAGIC)
+        while at + _RECORD.size <= size:  # the header, schemas and channels first
+            file.seek(at)
+            opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+            if opcode == _CHUNK:
+                group = _group(file, at, size)
+                return group is not None and bool(group.lengths)
+            at += _RECORD.size + length
+    return False
+
+
 class _Group(NamedTuple):
     """A chunk and the message indexes behind it."""
 

@@ -24,7 +24,7 @@ class SourceOptions:
     zed_conf: Path | None = None  # folder with SN<serial>.conf, or such a file
     stereo_depth: bool = False  # depth of SVO2 files by semi-global matching
     topics: tuple[str, ...] = ()  # "<camera>=<image topic>[,<camera info topic>[,<depth topic>]]"
-    same_clock: bool = False  # stamps of video files count from one moment
+    same_clock: bool = False  # the first pictures of video files without a table of stamps are of one moment
     intrinsics: Path | None = None  # of the cameras of videos; None: looked for beside them
     # Reads such a file: camera -> intrinsics; raises InputError where it holds none.
     read_cameras: Callable[[Path], Mapping[str, Camera]] = _no_reader

@@ -84,8 +84,14 @@ class RgbdFolder:
 
 
 def is_rgbd_folder(path: Path) -> bool:
-    """Whether a folder holds a recording or a camera of one, as far as names tell."""
-    return bool(_camera_folders(path))
+    """Whether a folder holds a recording or a camera of one, as names tell: some camera has a folder of images."""
+    return any((folder / IMAGE).is_dir() for folder in _camera_folders(path))
+
+
+def is_without_images(path: Path) -> bool:
+    """Whether a folder has cameras' descriptions alone, as an RGB-D folder without images has, and videos may have."""
+    folders = _camera_folders(path)
+    return bool(folders) and not any((folder / IMAGE).is_dir() for folder in folders)
 
 
 def _camera_folders(path: Path) -> list[Path]:

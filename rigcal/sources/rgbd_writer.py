@@ -24,6 +24,8 @@ from aruco.model import SILENT, BadFrame, Camera, Frame, Progress, Recording
 from rigcal.sources.camera_info import FILE_NAME, dump_camera_info
 from rigcal.sources.image_file import encode_depth, encode_png
 
+MAX_NAME_BYTES = 200  # file systems hold 255, of which suffixes take some
+_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 # Of a file that is being written.
 _HALF = ".half"
 
@@ -84,8 +86,12 @@ class RgbdFrames:
             (folder / name / "image").mkdir(parents=True, exist_ok=True)
 
     def finished(self, camera: str) -> NDArray[np.int64]:
-        """The stamps of a camera's frames that are there."""
-        stamps = [int(path.stem) for path in (self._folder / camera / "image").glob("*.png")]
+        """The stamps of a camera's frames that are there and whole: after a power failure files may be empty or cut."""
+        folder = self._folder / camera
+        files = [path for path in (folder / "image").glob("*.png") if path.stem.lstrip("-").isdecimal()]
+        stamps = [int(path.stem) for path in files if all(map(_is_whole, (path, *_companions(folder, path.stem))))]
+        if len(stamps) < len(files):
+            logger.info("{}: {} frames are not whole and are written again", folder, len(files) - len(stamps))
         return np.array(sorted(stamps), dtype=np.int64)
 
     def packed(self, frame: Frame) -> list[tuple[Path, bytes]]:
@@ -117,6 +123,27 @@ class RgbdFrames:
         """Leave the folder as it is, to be gone on with."""
 
 
+def _companions(folder: Path, stamp: str) -> Iterator[Path]:
+    for name in (f"depth/{stamp}.png", f"depth/{stamp}.npy", f"confidence/{stamp}.png"):
+        if (folder / name).exists():
+            yield folder / name
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether an image file ends as it was written, as far as its beginning and end tell."""
+    try:
+        if path.suffix == ".npy":
+            np.load(path, mmap_mode="r", allow_pickle=False)
+            return True
+        with path.open("rb") as file:
+            start = file.read(len(_PNG_START))
+            size = file.seek(0, 2)
+            file.seek(max(0, size - len(_PNG_END)))
+            return start == _PNG_START and file.read() == _PNG_END
+    except (OSError, ValueError, EOFError):
+        return False
+
+
 def fits_steps(depth_m: NDArray[np.float32], step_m: float) -> bool:
     """Whether 16-bit multiples of a step hold a depth image, but for the rounding of its float32 numbers."""
     measured = depth_m[np.isfinite(depth_m)].astype(np.float64)
@@ -144,8 +171,14 @@ def refuse_unusable_name(name: str) -> None:
     """Refuse a camera's name that would lead elsewhere as a folder's.
 
     Raises:
-        OutputError: It is empty, holds a separator or leads upwards.
+        OutputError: It is empty, too long, holds a separator or leads upwards.
     """
+    size = len(name.encode("utf-8", "surrogateescape"))
+    if size > MAX_NAME_BYTES:
+        raise OutputError(
+            f"camera {name[:40]!r}...: its name has {size} bytes, a folder's may have {MAX_NAME_BYTES}; rename the "
+            "camera."
+        )
     if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
         raise OutputError(f"camera {name!r}: a folder cannot have this name; rename the camera.")
 

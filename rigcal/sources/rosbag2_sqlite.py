@@ -7,7 +7,7 @@ Leaves    metadata.yaml and split bags to ros_bag, what messages mean to ros_mes
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
@@ -20,11 +20,13 @@ from aruco.errors import InputError
 from rigcal.sources.chunked_file import MAX_MESSAGES
 from rigcal.sources.decompression import MAX_MESSAGE_BYTES, DamagedError
 from rigcal.sources.message_store import Head, Topic, plain_type, span_of
+from rigcal.sources.topic_names import COMPRESSED, IMAGE
 
 SIGNATURE = b"SQLite format 3\0"
 # A complaint about a damaged file may hold bytes of it that are no text.
 DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
 MAX_TOPICS = 100_000
+MAX_METADATA_CHARS = 2**24
 _ROWS = 10_000
 
 
@@ -47,7 +49,7 @@ class SqliteStore:
         except DATABASE_ERRORS as error:
             raise InputError(f"{path}: is not a whole rosbag2 file ({error}); copy it again.") from error
         if not is_whole:
-            logger.warning("{}: is damaged or cut off; the {} messages that are found are used", path, len(rows))
+            _tell_loss(path, len(rows), {name for key, name, *_ in topics if (rows[:, 1] == key).any()})
         self._rows: dict[str, NDArray[np.int64]] = {}  # topic -> (n, 2) row and log time, in the file's order
         self.topics: dict[str, Topic] = {}
         for key, name, kind, encoding in topics:
@@ -97,6 +99,38 @@ class SqliteStore:
             else:
                 return base
         return sqlite3.connect(place, uri=True)  # the caller says what is wrong
+
+
+def _tell_loss(path: Path, found: int, there: Set[str]) -> None:
+    """Say what is used of a damaged file, and of how much where metadata.yaml beside it tells."""
+    total, counts = _stated(path)
+    of = f" of {total}" if total is not None and total >= found else ""
+    logger.warning("{}: is damaged or cut off; the {}{} messages that are found are used", path, found, of)
+    if lost := sorted(name for name in counts if name not in there):
+        logger.warning("{}: nothing was found of {}", path, ", ".join(f"{name} ({counts[name]})" for name in lost))
+
+
+def _stated(path: Path) -> tuple[int | None, dict[str, int]]:
+    """(messages of a file, messages of each image topic) as metadata.yaml states them; of a split bag no topics."""
+    import yaml
+
+    try:
+        with path.with_name("metadata.yaml").open(encoding="utf-8-sig") as file:
+            # The base loader makes texts, lists and maps only.
+            bag = yaml.load(file.read(MAX_METADATA_CHARS), Loader=yaml.BaseLoader)["rosbag2_bagfile_information"]
+        counts = {Path(one["path"]).name: int(one["message_count"]) for one in bag.get("files") or ()}
+        names = {Path(name).name for name in bag["relative_file_paths"]}
+        if names != {path.name}:
+            return counts.get(path.name), {}
+        images: dict[str, int] = {}
+        for one in bag.get("topics_with_message_count") or ():
+            about = one["topic_metadata"]
+            if plain_type(about["type"]) in (IMAGE, COMPRESSED) and int(one["message_count"]) > 0:
+                images[about["name"]] = int(one["message_count"])
+        return int(bag["message_count"]), images
+    except (OSError, yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        logger.debug("{}: its metadata.yaml tells nothing: {}", path, error)
+        return None, {}
 
 
 def _all_rows(base: sqlite3.Connection) -> tuple[NDArray[np.int64], bool]:

@@ -55,13 +55,18 @@ _MIN_DISPARITY_PX = 1.0
 class StereoMatcher:
     """Depth from rectified pairs of one stereo camera.
 
-    How good it is, measured on rendered pairs with 1.5 grey levels of noise, where truth is exact (disparity error as
-    1.4826 times the median deviation, its median, share of pixels with depth, share of those more than 1 px off):
+    How good it is where there is fine texture everywhere, measured on rendered pairs with 1.5 grey levels of noise
+    and exact truth (disparity error as 1.4826 times the median deviation, its median, share of pixels with depth, share
+    of those more than 1 px off):
 
         texture of   5 % of the brightness   0.12 px, below 0.01 px, 83 %, 0.02 %
         texture of  10 % of the brightness   0.07 px, below 0.01 px, 88 %, below 0.01 %
         a room, walls and floor of 10 %      0.11 px, below 0.01 px, 74 %, 0.08 %
         a wall without texture               no depth
+
+    Rooms are seldom like that. In the simulator's own room (box-static: plain floor and walls, a box with markers) only
+    5 to 9 % of the pixels have depth, none of them on floor or walls; of those 5 to 8 % are more than 1 px off, at
+    upright edges, and the median is off by less than 0.02 px.
 
     A distance z is off by ``z^2 / (f * baseline)`` times that: at 3 m 1 cm for 0.1 px, f = 700 px and a baseline of
     0.12 m. Real pairs add what their rectification is off by (a tenth of a pixel moves everything at 3 m by that

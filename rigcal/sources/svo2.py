@@ -64,7 +64,7 @@ def opened(path: Path, options: SourceOptions) -> Svo2:
     return Svo2(path, options)
 
 
-@dataclass(slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Source:
     """One camera of the file."""
 
@@ -72,7 +72,6 @@ class _Source:
     camera: Camera
     pictures: FramePictures
     rectification: Rectification
-    matcher: StereoMatcher | None = None  # made when it is first needed
 
 
 class Svo2:
@@ -86,6 +85,7 @@ class Svo2:
             MissingExtraError: A package is not installed.
         """
         self._path, self._stereo_depth = path, options.stereo_depth
+        self._up: dict[str, Array | None] = {}
         self._mcap = _container(path)
         topics = camera_topics(self._mcap)
         rows = footers(self._mcap, [camera.frames for camera in topics])
@@ -115,13 +115,16 @@ class Svo2:
         return self._frames(self._of(camera), indices, depth and self._stereo_depth)
 
     def up_in_camera(self, camera: str) -> Array | None:
-        """(3,) unit vector against gravity in the camera's axes, from its accelerometer; see svo2_sensors."""
-        sensors = self._of(camera).topics.sensors
-        if sensors is None:
-            return None
-        from rigcal.sources.svo2_sensors import up_in_camera
+        """(3,) unit vector against gravity in the camera's axes, from its accelerometer; see svo2_sensors.
 
-        return up_in_camera(self._mcap, sensors, camera)
+        The first call reads the sensor messages of the camera, the others remember.
+        """
+        sensors = self._of(camera).topics.sensors
+        if sensors is not None and camera not in self._up:
+            from rigcal.sources.svo2_sensors import up_in_camera
+
+            self._up[camera] = up_in_camera(self._mcap, sensors, camera)
+        return self._up.get(camera)
 
     def _of(self, camera: str) -> _Source:
         if camera not in self._sources:
@@ -171,16 +174,18 @@ class Svo2:
         raise unreadable_coding(self._path, topics.serial)
 
     def _frames(self, source: _Source, indices: Sequence[int], with_depth: bool) -> Iterator[Frame | BadFrame]:
+        # One for each reader: a matcher works in memory of its own, which two must not share.
+        matcher = _matcher(source) if with_depth else None
         for index, picture, digest in source.pictures.read(indices):
             if isinstance(picture, str):
                 yield self._bad(source, index, picture)
             else:
-                yield self._frame(source, index, picture, digest, with_depth)
+                yield self._frame(source, index, picture, digest, matcher)
 
-    def _frame(self, source: _Source, index: int, pair: Pair, digest: str, with_depth: bool) -> Frame:
+    def _frame(self, source: _Source, index: int, pair: Pair, digest: str, matcher: StereoMatcher | None) -> Frame:
         width = source.camera.width
         left = source.rectification.left(pair[:, :width])
-        depth_m = self._depth(source, left, pair[:, width:]) if with_depth else None
+        depth_m = None if matcher is None else matcher.depth_m(left, source.rectification.right(pair[:, width:]))
         return Frame(
             camera=source.camera.name,
             stamp_ns=int(source.pictures.index.stamps_ns[index]),
@@ -189,23 +194,22 @@ class Svo2:
             depth_m=depth_m,
         )
 
-    def _depth(self, source: _Source, left: NDArray[np.uint8], recorded_right: Pair) -> NDArray[np.float32]:
-        if source.matcher is None:
-            from rigcal.sources.stereo_depth import StereoMatcher
-
-            source.matcher = StereoMatcher(
-                K=source.rectification.K,
-                baseline_m=source.rectification.baseline_m,
-                size=(source.camera.width, source.camera.height),
-            )
-        return source.matcher.depth_m(left, source.rectification.right(recorded_right))
-
     def _bad(self, source: _Source, index: int, what: str) -> BadFrame:
         name, message = source.camera.name, int(source.pictures.index.messages[index])
         # Named from the camera on, so that the reason does not depend on where the recording lies.
         reason = f"{name}: frame {message} {what}"
         logger.debug("skipped: {}", reason)
         return BadFrame(name, int(source.pictures.index.stamps_ns[index]), reason)
+
+
+def _matcher(source: _Source) -> StereoMatcher:
+    from rigcal.sources.stereo_depth import StereoMatcher
+
+    return StereoMatcher(
+        K=source.rectification.K,
+        baseline_m=source.rectification.baseline_m,
+        size=(source.camera.width, source.camera.height),
+    )
 
 
 def _container(path: Path) -> McapIndex:

@@ -21,7 +21,6 @@ from rigcal.sources.svo2_payload import FOOTER, Footer, FrameError, footer_of
 # In the descriptions the frames are numbered; where fewer than this go up by one, the numbers mean something else.
 _NUMBERED = 0.9
 
-
 # A frame's footer, or why it has none: what completes "frame <n> ...".
 Row: TypeAlias = Footer | str
 LOST = "is lost with its part of the file"

@@ -65,6 +65,11 @@ def empty_folder(path: Path) -> InputError:
     )
 
 
+def why_left_out(path: Path, head: bytes) -> str:
+    """Why a file is left out that lies beside recordings and is named like one."""
+    return _look(path, head)
+
+
 def unfinished(path: Path) -> InputError:
     """What to say about the folder of an interrupted conversion."""
     whole = path.with_suffix("")
@@ -82,14 +87,15 @@ def _look(path: Path, head: bytes) -> str:
     for signature, look in _LOOKS:
         if head.startswith(signature):
             return look
-    if _is_text(head):
+    if is_text(head):
         return _text_look(path)
     suffix = path.suffix.lower()
     named = f" although it is named {suffix}" if suffix else ""
     return f"does not begin like any recording that is known here{named}; it may be damaged, copy it again"
 
 
-def _is_text(head: bytes) -> bool:
+def is_text(head: bytes) -> bool:
+    """Whether first bytes are text, which no recording begins with for long."""
     try:
         head[:-4].decode("utf-8")  # a character may be cut at the end
     except UnicodeDecodeError:
@@ -106,4 +112,5 @@ def _text_look(path: Path) -> str:
         return "is a text file; the intrinsics of videos go to --intrinsics, and the recording itself is wanted here"
     if path.suffix.lower() == ".conf":
         return "is a text file; a ZED calibration goes to --zed-conf, and the recording itself is wanted here"
-    return "is a text file, not a recording"
+    named = f" although it is named {path.suffix}" if path.suffix.lower() in RECORDING_SUFFIXES else ""
+    return f"is a text file, not a recording{named}"

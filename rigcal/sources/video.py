@@ -89,6 +89,10 @@ class VideoFiles:
         """A camera's frames at ascending indices into its stamps, decoded one after the other."""
         return self._video(camera).read_frames(indices)
 
+    def file_of(self, camera: str) -> Path:
+        """The file that a camera's frames are in; raises InputError for an unknown camera."""
+        return self._video(camera).index.path
+
     def _video(self, camera: str) -> _Video:
         if camera not in self._videos:
             raise InputError(f"no camera {camera} among the videos; they are {', '.join(sorted(self._videos))}.")
@@ -108,6 +112,9 @@ class _Video:
         camera = camera_of_video(path, index.size, options, alone=alone)
         if table is None:
             stamps = index.stamps_ns()
+            if options.same_clock:
+                # Files of one camera begin at zero in one container and 80 ms later in another.
+                stamps = stamps - stamps[0]
         else:
             stamps = read_stamps(table, path.stem, len(index.frames), alone=alone, may_be_cut=bool(index.loss))
         kept = np.flatnonzero(index.decodable & (stamps != NO_STAMP))

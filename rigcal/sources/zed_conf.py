@@ -14,7 +14,7 @@ from __future__ import annotations
 import configparser
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,7 +93,8 @@ class Rectification:
 
     K: Array  # (3, 3) of both rectified images
     baseline_m: float
-    R_rect_left: Array  # (3, 3) from the recorded left eye's axes into the rectified ones
+    # (3, 3) from the recorded left eye's axes into the rectified ones: how the tests know where a point must land
+    R_rect_left: Array
     left_maps: tuple[NDArray[Any], NDArray[Any]]  # of cv2.remap
     right_maps: tuple[NDArray[Any], NDArray[Any]]
 
@@ -190,6 +191,24 @@ def find_conf(serial: str, asked: Path | None, beside: Path) -> Path:
     )
 
 
+def require_one_camera(asked: Path, serials: Sequence[str]) -> None:
+    """Refuse a file whose name has no serial number for more than one camera.
+
+    Args:
+        asked: What the user gave: a folder of conf files or one of them.
+        serials: Of all cameras that were rectified with what was given.
+
+    Raises:
+        InputError: It is one file of nobody knows which camera, and there are several.
+    """
+    named = sorted(set(serials))
+    if len(named) > 1 and asked.is_file() and _serial_in(asked.name) is None:
+        raise InputError(
+            f"{asked}: does not say whose calibration it is, and cannot be that of cameras {', '.join(named)} all; "
+            "give --zed-conf a folder with SN<serial>.conf of each camera."
+        )
+
+
 def _listed(folders: list[Path]) -> str:
     return ", ".join(dict.fromkeys(str(folder) for folder in folders))
 
@@ -258,7 +277,7 @@ def _stereo(path: Path, section: Mapping[str, str], name: str) -> tuple[Array, A
     """(R_right_left, t_right_left [m]) of one resolution."""
     (baseline_mm,) = _numbers(path, "STEREO", section, ("baseline",))
     # Files of the first cameras have no offsets; some of the newer ones have one for each resolution.
-    offsets = {f"{key}": section.get(f"{key}_{name}".lower(), section.get(key, "0")) for key in ("ty", "tz")}
+    offsets = {key: section.get(f"{key}_{name}".lower(), section.get(key, "0")) for key in ("ty", "tz")}
     ty_mm, tz_mm = _numbers(path, "STEREO", offsets, ("ty", "tz"))
     angles = _numbers(path, "STEREO", section, tuple(f"{key}_{name}".lower() for key in ("rx", "cv", "rz")))
     sound = _BASELINES_MM[0] <= baseline_mm <= _BASELINES_MM[1] and max(abs(ty_mm), abs(tz_mm)) < 0.5 * baseline_mm

@@ -25,8 +25,11 @@ from aruco.errors import InputError
 # ZED files have a key frame every two seconds at most: 60 frames at 30 a second. The SDK decodes from the last one
 # after a jump, so for half of that going on is no dearer.
 _NEAR = 30
-# Where a frame is looked for: at its place, then from some frames before it, then from before the last key frame.
-_LEADS = (0, 4, 64)
+# Jumps miss by at most so many frames, or are known to miss by more.
+_NEAR_MISS = 4
+# Where a frame is looked for: at its place, then from some frames before it, then from before the last key frame; once
+# more from near by, because a miss that the last search met is known now, but its frame may have gone by unmeasured.
+_LEADS = (0, _NEAR_MISS, 64, _NEAR_MISS)
 # So many grabs beyond the place still look for a frame.
 _LATE = 3
 # Grabs that fail in a row before the rest of a file is given up.
@@ -44,6 +47,10 @@ _CURES = {
     "NOT_ENOUGH_GPU_MEMORY": "choose a lighter --depth-mode, or close other programs that use the GPU",
     "CORRUPTED_SDK_INSTALLATION": "install the SDK again, with its AI module for NEURAL depth modes",
 }
+
+
+class RefusedError(InputError):
+    """The SDK does not open a file."""
 
 
 class NotShownError(Exception):
@@ -118,7 +125,7 @@ class Player:
                     self._close()
 
     def information(self) -> Any:
-        """The SDK's CameraInformation; raises InputError if it refuses the file."""
+        """The SDK's CameraInformation; raises RefusedError if it refuses the file."""
         with self._lock:
             return self._opened(depth=False).get_camera_information()
 
@@ -181,7 +188,7 @@ class Player:
         if _is_failure(sl, error):
             camera.close()
             cure = _CURES.get(error.name, "try it in the SDK's own ZED Explorer")
-            raise InputError(f"{self._path}: the ZED SDK cannot open it ({error.name}); {cure}.")
+            raise RefusedError(f"{self._path}: the ZED SDK cannot open it ({error.name}); {cure}.")
         if error != sl.ERROR_CODE.SUCCESS:
             logger.warning("{}: the ZED SDK opened it with a warning: {}", self._path, error.name)
         self._camera, self._has_depth, self._next = camera, depth, 0
@@ -228,8 +235,8 @@ class Player:
         if jumps:
             self._seek(camera, max(place.position - lead, 0))
         while self._next <= place.position + _LATE:
-            # On the way depth would be computed for nothing, unless places have turned out to be unreliable.
-            measured = depth and (lead > 0 or self._next >= place.position)
+            # On the way depth would be computed for nothing; near the place only where places are unreliable.
+            measured = depth and self._next >= place.position - min(lead, _NEAR_MISS)
             error = self._grab(camera, self._measuring if measured else self._plain)
             failed = _is_failure(self._sl, error)
             if not failed and self._stamp_ns(camera) == place.stamp_ns:

@@ -31,11 +31,10 @@ from aruco.pose_math import Array
 from aruco.svo_sync import MAX_STAMP_NS
 from rigcal.sources.image_file import MAX_PIXELS
 from rigcal.sources.options import SourceOptions
+from rigcal.sources.zed_gravity import up_of
 from rigcal.sources.zed_player import NotShownError, Pass, Place, Player
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-# What an accelerometer at rest measures [m/s^2]: gravity, within what its calibration leaves.
-_GRAVITY = (8.8, 10.8)
 
 
 def is_available() -> bool:
@@ -60,7 +59,8 @@ def opened(path: Path, options: SourceOptions) -> ZedRecording:
     """Open an SVO or SVO2 file with the SDK.
 
     Raises:
-        InputError: The SDK is not installed, refuses the file, or does not offer the depth mode.
+        RefusedError: The SDK does not open the file.
+        InputError: The SDK is not installed, or does not offer the depth mode.
     """
     return ZedRecording(path, options, _sdk(path))
 
@@ -88,13 +88,12 @@ def _broken(path: Path, error: Exception) -> InputError:
     )
 
 
-def depth_mode_of(sl: Any, name: str) -> Any:
-    """The SDK's depth mode of a name.
+def depth_mode_named(name: str, offered: Sequence[str], by: str = "the ZED SDK") -> str:
+    """The one of some depth modes that a user named, in whatever case.
 
     Raises:
-        InputError: The SDK has no such mode, or the mode invents distances.
+        InputError: It is none of them, or invents distances.
     """
-    offered = [mode.name for mode in sl.DEPTH_MODE if mode.name not in ("NONE", "LAST")]
     wanted = name.upper()
     if "FILL" in wanted:
         raise InputError(
@@ -102,8 +101,18 @@ def depth_mode_of(sl: Any, name: str) -> Any:
             f"them; choose one of {', '.join(offered)}."
         )
     if wanted not in offered:
-        raise InputError(f"--depth-mode {name}: the installed ZED SDK has no such mode; choose {', '.join(offered)}.")
-    return sl.DEPTH_MODE[wanted]
+        raise InputError(f"--depth-mode {name}: {by} has no such mode; choose {', '.join(offered)}.")
+    return wanted
+
+
+def depth_mode_of(sl: Any, name: str) -> Any:
+    """The SDK's depth mode of a name.
+
+    Raises:
+        InputError: The SDK has no such mode, or the mode invents distances.
+    """
+    offered = [mode.name for mode in sl.DEPTH_MODE if mode.name not in ("NONE", "LAST")]
+    return sl.DEPTH_MODE[depth_mode_named(name, offered, "the installed ZED SDK")]
 
 
 class ZedRecording:
@@ -160,25 +169,24 @@ class ZedRecording:
     def up_in_camera(self, camera: str) -> Array | None:
         """(3,) unit vector against gravity in the axes of the left eye: the median over the recording.
 
-        None for cameras without an accelerometer and files that do not hold what it measured (SVO of version 1).
+        None for cameras without an accelerometer, files that do not hold what it measured (SVO of version 1), and
+        samples that zed_gravity does not believe.
         """
         self._check(camera)
-        accelerations = self._index[2]
-        if self._R_cam_imu is None or not len(accelerations):
-            return None
-        median = np.median(accelerations, axis=0)
-        size = float(np.linalg.norm(median))
-        if not _GRAVITY[0] <= size <= _GRAVITY[1]:
-            logger.debug("camera {}: the accelerometer measured {:.2f} m/s^2, which is not gravity", camera, size)
-            return None
-        # At rest it measures what keeps the camera from falling: upwards.
-        up = self._R_cam_imu @ (median / size)
-        up.setflags(write=False)
-        return up
+        return self._up
 
     def _check(self, camera: str) -> None:
         if camera != self._camera.name:
             raise InputError(f"no camera {camera} in the recording; it has {self._camera.name}.")
+
+    @cached_property
+    def _up(self) -> Array | None:
+        up_imu = None if self._R_cam_imu is None else up_of(self._index[2], self._camera.name)
+        if self._R_cam_imu is None or up_imu is None:
+            return None
+        up = self._R_cam_imu @ up_imu
+        up.setflags(write=False)
+        return up
 
     @cached_property
     def _index(self) -> tuple[NDArray[np.int64], tuple[int, ...], Array]:
