@@ -326,7 +326,7 @@ def test_wrong_usage_is_exit_code_2(demo_folder: Path, tmp_path: Path) -> None:
 
 def test_an_svo_says_what_to_do(tmp_path: Path) -> None:
     svo = tmp_path / "rec.svo2"
-    svo.write_bytes(b"x" * 100)
+    svo.write_bytes(bytes(range(256)))
     assert_one_sentence(run("--svo", svo, "--markers", BOX, "-o", tmp_path / "o.json"), "rec.svo2", "ZED SDK")
 
 
