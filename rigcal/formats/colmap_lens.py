@@ -16,9 +16,8 @@ import numpy as np
 from aruco.errors import InputError
 from aruco.model import Camera, DistortionModel
 from aruco.pose_math import Array
-from rigcal.formats.rig import pinhole_of
-
-HALF_PIXEL = 0.5
+from rigcal.formats.reading import placed
+from rigcal.formats.rig import HALF_PIXEL, pinhole_of
 
 # Model -> its parameters in order. f stands for both focal lengths.
 PARAMETERS: dict[str, tuple[str, ...]] = {
@@ -75,7 +74,5 @@ def camera_of_model(name: str, model: str, width: int, height: int, parameters: 
     elif any(given.get(key, 0.0) for key in _BROWN[5:]):
         kind, order = "rational_polynomial", _BROWN
     distortion = np.array([given.get(key, 0.0) for key in order])
-    try:
+    with placed(where):
         return Camera(name=name, width=width, height=height, K=K, distortion_model=kind, distortion=distortion)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error

@@ -23,8 +23,10 @@ from aruco.model import Camera, DistortionModel, UpAxis
 from aruco.pose_math import Array, Pose
 from rigcal.formats.image_names import image_name
 from rigcal.formats.native import read_json, write_json
-from rigcal.formats.reading import matrix, number, whole, word
+from rigcal.formats.reading import matrix, number, placed, whole, word
 from rigcal.formats.rig import (
+    HALF_PIXEL,
+    HALF_TURN_X,
     ExportOptions,
     Format,
     Rig,
@@ -40,8 +42,6 @@ from rigcal.formats.rotations import nearest_rotation, rigid_pose, steady
 
 NAME = "nerfstudio"
 DEFAULT_PATTERN = "{camera}.png"
-HALF_PIXEL = 0.5
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # nerfstudio's names of the coefficients, in OpenCV's order.
 _PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3")
 _FISHEYE = ("k1", "k2", "k3", "k4")
@@ -59,7 +59,7 @@ _MODELS: Mapping[str, DistortionModel] = {
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     """Write the file; see Format.write."""
-    poses = {name: z_up(T) @ _OPENGL for name, T in y_up(rig, NAME).items()}
+    poses = {name: z_up(T) @ HALF_TURN_X for name, T in y_up(rig, NAME).items()}
     frames = [
         {
             "file_path": image_name(options.image_name or DEFAULT_PATTERN, name, NAME),
@@ -80,7 +80,7 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
 
 def _applied(up: UpAxis | None) -> Array:
     """The (3, 4) transform from the calibration's world into the file's."""
-    T_y_up = np.eye(4) if up == "+y" else _OPENGL
+    T_y_up = np.eye(4) if up == "+y" else HALF_TURN_X
     return z_up(T_y_up)[:3] + 0.0
 
 
@@ -126,7 +126,7 @@ def read(path: Path) -> Rig:
             )
         T_file_gl = rigid_pose(_padded(frame.get("transform_matrix"), f"{where}: transform_matrix"), where)
         T_file_gl[:3, 3] /= scale
-        poses[name] = R_world_file @ T_file_gl @ _OPENGL
+        poses[name] = R_world_file @ T_file_gl @ HALF_TURN_X
         camera = _camera(name, {**frame, **content}, where)
         cameras.update({} if camera is None else {name: camera})
     return Rig(T_world_cam=poses, up=up, cameras=cameras)
@@ -191,10 +191,8 @@ def _camera(name: str, keys: Mapping[str, Any], where: str) -> Camera | None:
     K[:2, 2] = told("cx") - HALF_PIXEL, told("cy") - HALF_PIXEL
     distortion = np.array([told(key, 0.0) for key in (_FISHEYE if kind == "equidistant" else _PERSPECTIVE)])
     width, height = whole(keys.get("w"), f"{where}: w"), whole(keys.get("h"), f"{where}: h")
-    try:
+    with placed(where):
         return Camera(name=name, width=width, height=height, K=K, distortion_model=kind, distortion=distortion)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 def recognises(path: Path, head: bytes) -> bool:

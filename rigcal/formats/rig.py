@@ -21,8 +21,10 @@ UP_WORDS: Mapping[str, UpAxis] = {"+y": "+y", "-y": "-y"}
 # How the word for a camera stands in a pattern.
 CAMERA_WORD = "{camera}"
 
-# A world with Y up from one with Y down, and back: half a turn about x.
-_HALF_TURN_X = np.diag([1.0, -1.0, -1.0])
+# Half a turn about x: of a world, Y up from Y down and back; of a camera, OpenGL's axes from OpenCV's and back.
+HALF_TURN_X = np.diag([1.0, -1.0, -1.0, 1.0])
+# What principal points that count from the corner of the top left pixel have more than those from its centre [px].
+HALF_PIXEL = 0.5
 # (x, y, z) -> (x, -z, y): a world with Z up from one with Y up, a quarter turn about x.
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -114,7 +116,7 @@ def y_up(rig: Rig, who: str) -> dict[str, Pose]:
     check_up(rig, who)
     if rig.up == "+y":
         return dict(rig.T_world_cam)
-    return {name: turned(_HALF_TURN_X, T) for name, T in rig.T_world_cam.items()}
+    return {name: turned(HALF_TURN_X[:3, :3], T) for name, T in rig.T_world_cam.items()}
 
 
 def z_up(T_world_cam: Pose) -> Pose:

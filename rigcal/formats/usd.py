@@ -22,8 +22,9 @@ from aruco.atomic import write_whole
 from aruco.errors import InputError
 from aruco.model import Camera, DistortionModel, UpAxis
 from aruco.pose_math import Array, Pose
-from rigcal.formats.reading import number, numbers, read_text, whole
+from rigcal.formats.reading import number, numbers, placed, read_text, whole
 from rigcal.formats.rig import (
+    HALF_TURN_X,
     ExportOptions,
     Format,
     Rig,
@@ -42,7 +43,6 @@ WHAT = "a USD text file"
 MAGIC, BINARY_MAGIC, ZIP_MAGIC = b"#usda", b"PXR-USDC", b"PK\x03\x04"
 # A camera takes about one KiB; a scene's meshes would take minutes to read.
 MAX_TEXT_BYTES = 8 * 2**20
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _PREFIX = "camera_"
 # What USD takes a stage's unit for when it does not say: centimetres.
 _FALLBACK_UNIT_M = 0.01
@@ -75,7 +75,7 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     lines += ['    defaultPrim = "Rig"', "    metersPerUnit = 1", *(['    upAxis = "Y"'] if rig.up else []), ")", ""]
     lines += ['def Xform "Rig"', "{"]
     for name, T in poses.items():
-        lines += [f"    {line}".rstrip() for line in _camera_lines(rig.cameras[name], T @ _OPENGL)]
+        lines += [f"    {line}".rstrip() for line in _camera_lines(rig.cameras[name], T @ HALF_TURN_X)]
     write_whole(out, "\n".join([*lines, "}", ""]).encode())
 
 
@@ -139,7 +139,7 @@ def read(path: Path) -> Rig:
         check_name(str(name), where)
         if name in poses:
             raise InputError(f"{where}: there are two cameras {name}; rename one.")
-        T = rigid_pose(_unscaled(T_stage_gl), where) @ _OPENGL
+        T = rigid_pose(_unscaled(T_stage_gl), where) @ HALF_TURN_X
         T[:3, 3] *= unit_m
         poses[str(name)] = y_up_of_z_up(T) if axis == "Z" else T
         camera = _lens(prim, str(name), ours, where)
@@ -233,10 +233,8 @@ def _lens(prim: Prim, name: str, ours: Mapping[str, Any], where: str) -> Camera 
             logger.warning("{}: its lens was changed since it was written; what USD shows is taken", where)
     model: DistortionModel = ours.get("distortion_model", "plumb_bob")
     distortion = numbers(ours.get("distortion_coefficients", []), f"{where}: distortion_coefficients")
-    try:
+    with placed(where):
         return Camera(name=name, width=width, height=height, K=K, distortion_model=model, distortion=distortion)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 def _film(prim: Prim, where: str) -> Film:

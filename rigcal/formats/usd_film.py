@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from aruco.pose_math import Array
+from rigcal.formats.rig import HALF_PIXEL
 
-HALF_PIXEL = 0.5
 # In USD's units, tenths of a world unit (here a metre): 25 mm.
 _FOCAL = 0.25
 # So many focal lengths are tried, one float32 after another. The first would be off by up to 4e-5 px in a 4K image, the

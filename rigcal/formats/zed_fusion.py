@@ -27,12 +27,10 @@ from aruco.pose_math import Pose, matrix_to_rvec_tvec, pose_text, rvec_tvec_to_m
 from rigcal.formats.json_edit import Edit, Span, before, edited, members
 from rigcal.formats.native import json_bytes
 from rigcal.formats.reading import number, numbers, read_text
-from rigcal.formats.rig import ExportOptions, Format, Rig, listed, y_up
+from rigcal.formats.rig import HALF_TURN_X, ExportOptions, Format, Rig, listed, y_up
 from rigcal.formats.rotations import rigid_pose, steady, words
 
 NAME = "zed-fusion"
-# A world with y down from one with Y up, and back.
-T_DOWN_UP = np.diag([1.0, -1.0, -1.0, 1.0])
 # The key under which a camera has its pose: SDK 5.x, SDK 4.x.
 LAYOUTS = ("FusionConfiguration", "world")
 # The SDK holds a serial number in 32 bits; a number with zeros before it would not come back.
@@ -50,7 +48,7 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
         InputError: A name is no serial number, nobody knows what is up, or the file to fill cannot be used.
         OutputError: The file cannot be written.
     """
-    T_disk = {_checked_serial(name): T_DOWN_UP @ T for name, T in y_up(rig, NAME).items()}
+    T_disk = {_checked_serial(name): HALF_TURN_X @ T for name, T in y_up(rig, NAME).items()}
     if options.into is not None:
         write_whole(out, _filled_file(options.into, T_disk))
     else:
@@ -78,7 +76,7 @@ def read(path: Path) -> Rig:
             logger.warning(
                 "{}: camera {} has serial_number {}; it is taken for {}", path, serial, str(stated)[:40], serial
             )
-    return Rig(T_world_cam={serial: T_DOWN_UP @ T for serial, T in poses.items()}, up="+y")
+    return Rig(T_world_cam={serial: HALF_TURN_X @ T for serial, T in poses.items()}, up="+y")
 
 
 def recognises(path: Path, head: bytes) -> bool:

@@ -1,21 +1,22 @@
 """Containers that keep messages in chunks (MCAP, ROS 1 bags): where messages lie, and reading one of them.
 
 Owns      the index of messages while and after it is built, chunks that turn out to be damaged, memory.
-Leaves    what records look like to mcap_walk and rosbag1_walk, compressed blocks to decompression.
+Leaves    what records look like to mcap_walk and rosbag1_index, compressed blocks to decompression.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, Protocol
 
 import numpy as np
 from loguru import logger
 from numpy.typing import NDArray
 
+from aruco.errors import InputError
 from rigcal.sources.decompression import DamagedError, decompressed
 
 # A day of a 400 Hz sensor has 35 million; each costs 20 bytes here.
@@ -126,17 +127,52 @@ class IndexBuilder:
         order = np.lexsort((offsets, chunks))
         return Places(log_times_ns=times[order], chunks=chunks[order], offsets=offsets[order])
 
-    def span_s(self) -> float:
+    def must_look_into(self, chunk: int, known: Collection[int]) -> bool:
+        """Whether a chunk has no index, or its index names a channel that is not among the known ones."""
+        return chunk in self.unindexed or not self.users.get(chunk, set()) <= {*known}
+
+    def loss(self, at: int, size: int) -> str:
+        """How a file of so many bytes ends that is cut off in the record at some byte; completes "<file> ..."."""
+        return (
+            f"is cut off: the record at byte {at} of {size} is not whole; the {self._span_s():.3f} s of messages "
+            "before are used"
+        )
+
+    def _span_s(self) -> float:
         """Seconds from the first message to the last."""
-        times = [times for pieces in self._pieces.values() for times in pieces.log_times_ns]
-        return (max(int(a.max()) for a in times) - min(int(a.min()) for a in times)) / 1e9 if times else 0.0
+        span = span_of([times for pieces in self._pieces.values() for times in pieces.log_times_ns])
+        return 0.0 if span is None else (span[1] - span[0]) / 1e9
+
+
+def span_of(log_times_ns: Sequence[NDArray[np.int64]]) -> tuple[int, int] | None:
+    """The first and the last of all times; None where there are none."""
+    times = [times for times in log_times_ns if len(times)]
+    return (min(int(t.min()) for t in times), max(int(t.max()) for t in times)) if times else None
+
+
+class Walk(Protocol):
+    """One pass over a file's records."""
+
+    index: IndexBuilder
+
+    def through(self, file: IO[bytes]) -> None:
+        """Walk from the first record to the end, or to where the file is cut off."""
+        ...
+
+    def must_look_into(self, chunk: int) -> bool:
+        """Whether a chunk's contents are needed to know its messages and their channels."""
+        ...
+
+    def look_into(self, data: memoryview, chunk: int) -> None:
+        """Learn from a chunk's contents what its index does not say."""
+        ...
 
 
 class ChunkedFile:
     """Messages by channel and number. Nothing stays open; one chunk at most stays in memory."""
 
     def __init__(self, path: Path, chunks: Sequence[Chunk], extent: Extent) -> None:
-        """A file whose chunks are known; ``places`` is set when the index is complete.
+        """A file whose chunks are known, or will be; ``places`` is set when the index is complete.
 
         Args:
             path: The file.
@@ -149,6 +185,36 @@ class ChunkedFile:
         self._extent = extent
         self._cached: tuple[int, memoryview] | None = None
         self._lost: set[int] = set()
+
+    def walk_through(self, walk: Walk, what: str) -> None:
+        """Find the chunks and what lies in them; no message is read.
+
+        Args:
+            walk: Over the file's records; its index has the chunks.
+            what: The file is: "file", "bag".
+
+        Raises:
+            InputError: It is something else, damaged beyond use, or of absurd sizes.
+        """
+        try:
+            with self.path.open("rb") as file:
+                walk.through(file)
+                # Chunks without an index, and those that define a channel which nothing else does.
+                for number in filter(walk.must_look_into, range(len(self._chunks))):
+                    try:
+                        walk.look_into(self.contents(file, number), number)
+                    except DamagedError as error:
+                        logger.debug("{}: chunk {} is not indexed: {}", self.path, number, error)
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be read ({error.strerror or error}); mend its permissions."
+            ) from error
+        except DamagedError as error:
+            raise InputError(f"{self.path}: {error}; record or copy the {what} again.") from error
+
+    def log_times_ns(self, channel: int) -> NDArray[np.int64]:
+        """(n,) when each message was logged, in the order in which they lie in the file."""
+        return self.places[channel].log_times_ns
 
     def message(self, channel: int, index: int) -> bytes:
         """The bytes of a channel's message; raises DamagedError where its chunk is lost."""
@@ -210,9 +276,9 @@ class ChunkedFile:
         places = self.places[channel]
         number, offset = int(places.chunks[index]), int(places.offsets[index])
         if number == NO_CHUNK:
-            read, end = _reader(file, 0), file.seek(0, 2)
+            read, end = reader(file), file.seek(0, 2)
         elif not whole and self._chunks[number].compression in ("", "none"):
-            read, end = _reader(file, self._chunks[number].at), self._chunks[number].stored
+            read, end = reader(file, self._chunks[number].at), self._chunks[number].stored
         else:
             data = self.contents(file, number)
             read, end = (lambda at, size: bytes(data[at : at + size])), len(data)
@@ -233,7 +299,9 @@ def _file_order(places: Sequence[Places]) -> Iterator[tuple[int, int]]:
         yield int(which[at]), int(index[at])
 
 
-def _reader(file: IO[bytes], base: int) -> Read:
+def reader(file: IO[bytes], base: int = 0) -> Read:
+    """Reading of a file from some byte on."""
+
     def read(at: int, size: int) -> bytes:
         file.seek(base + at)
         return file.read(size)

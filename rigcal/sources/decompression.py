@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Iterator
+from typing import Any
 
 from aruco.errors import MissingExtraError
 
@@ -107,17 +108,15 @@ def _lz4_pieces(data: bytes | memoryview, size: int) -> Iterator[bytes]:
         import lz4.frame
     except ImportError as error:
         raise MissingExtraError("lz4", "bags") from error
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    piece = decompressor.decompress(data, max_length=size)
-    while piece or not (decompressor.eof or decompressor.needs_input):
-        yield piece
-        if decompressor.eof:
-            return
-        piece = decompressor.decompress(b"", max_length=size)
+    yield from _pieces_of(lz4.frame.LZ4FrameDecompressor(), data, size)
 
 
 def _bz2_pieces(data: bytes | memoryview, size: int) -> Iterator[bytes]:
-    decompressor = bz2.BZ2Decompressor()
+    yield from _pieces_of(bz2.BZ2Decompressor(), data, size)
+
+
+def _pieces_of(decompressor: Any, data: bytes | memoryview, size: int) -> Iterator[bytes]:
+    """Of one whose decompress takes a limit."""
     piece = decompressor.decompress(data, max_length=size)
     while piece or not (decompressor.eof or decompressor.needs_input):
         yield piece

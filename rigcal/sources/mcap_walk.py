@@ -95,7 +95,7 @@ class McapWalk:
 
     def must_look_into(self, chunk: int) -> bool:
         """Whether a chunk has no index, or its index names a channel of which no definition is known yet."""
-        return chunk in self.index.unindexed or bool(self.index.users.get(chunk, set()) - self._channels.keys())
+        return self.index.must_look_into(chunk, self._channels)
 
     def look_into(self, data: memoryview, chunk: int) -> None:
         """Definitions, and messages where there is no index, of those records of a chunk that are whole."""
@@ -140,10 +140,7 @@ class McapWalk:
         """How the file ends if it is cut off; completes "<file> ..."."""
         if self._cut_at is None or self._has_all_data:
             return None
-        return (
-            f"is cut off: the record at byte {self._cut_at} of {self._size} is not whole; "
-            f"the {self.index.span_s():.3f} s of messages before are used"
-        )
+        return self.index.loss(self._cut_at, self._size)
 
     def _handlers(self) -> Mapping[int, Callable[[IO[bytes], int, int], None]]:
         def define(opcode: int) -> Callable[[IO[bytes], int, int], None]:

@@ -1,6 +1,6 @@
 """Messages by topic and number, whatever container they lie in.
 
-Owns      what a container of ROS messages offers, and several files as one.
+Owns      what a container of ROS messages offers, channels as topics, and several files as one.
 Leaves    the containers to mcap_file, rosbag1_index and rosbag2_sqlite, messages to ros_messages.
 """
 
@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aruco.errors import InputError
+from rigcal.sources.chunked_file import ChunkedFile, span_of
 from rigcal.sources.decompression import MAX_MESSAGE_BYTES, DamagedError, decompressed_head
 
 
@@ -71,10 +71,45 @@ def plain_type(name: str) -> str:
     return "/".join(parts).removesuffix("_") if "::" in name else "/".join(parts)
 
 
-def span_of(log_times_ns: Sequence[NDArray[np.int64]]) -> tuple[int, int] | None:
-    """The first and the last of all times; None where there are none."""
-    times = [times for times in log_times_ns if len(times)]
-    return (min(int(t.min()) for t in times), max(int(t.max()) for t in times)) if times else None
+class ChannelStore:
+    """Messages of a file that keeps them by channel, of which several may be one topic's; a part of a MessageStore.
+
+    Messages of several publishers of a topic are numbered one publisher after the other.
+    """
+
+    def __init__(self, index: ChunkedFile, ids: Mapping[str, Sequence[int]]) -> None:
+        """The channels of each topic."""
+        self._index = index
+        self._ids = ids
+        self._firsts: dict[int, int] = {}  # number of a channel's first message among its topic's
+        for group in ids.values():
+            counts = [len(index.log_times_ns(channel)) for channel in group]
+            self._firsts.update(zip(group, np.cumsum([0, *counts]).tolist()))
+
+    def message(self, topic: str, index: int) -> bytes:
+        """A message's bytes; raises DamagedError where they are lost."""
+        channel = [channel for channel in self._ids[topic] if self._firsts[channel] <= index][-1]
+        return self._index.message(channel, index - self._firsts[channel])
+
+    def heads(self, topics: Sequence[str], size: int) -> Iterator[Head]:
+        """The first bytes of every message of some topics."""
+        names = {channel: topic for topic in topics for channel in self._ids[topic]}
+        times = {channel: self._index.log_times_ns(channel) for channel in names}
+        for part in self._index.parts(list(names), size):
+            yield Head(
+                topic=names[part.channel],
+                index=self._firsts[part.channel] + part.index,
+                log_time_ns=int(times[part.channel][part.index]),
+                data=part.data,
+            )
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """When the first and the last message were logged; None without messages."""
+        return span_of([self._index.log_times_ns(channel) for channel in self._firsts])
+
+    def count(self, topic: str) -> int:
+        """How many messages a topic has."""
+        return sum(len(self._index.log_times_ns(channel)) for channel in self._ids[topic])
 
 
 class SplitStore:

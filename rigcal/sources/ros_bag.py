@@ -7,7 +7,7 @@ Leaves    the containers to rosbag1_index, rosbag2_sqlite and mcap_file, what me
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePath
@@ -18,9 +18,9 @@ from loguru import logger
 
 from aruco.errors import InputError
 from aruco.model import Recording
-from rigcal.sources.message_store import Head, MessageStore, SplitStore, Topic, ZstdMessages, plain_type, span_of
+from rigcal.sources.message_store import ChannelStore, MessageStore, SplitStore, Topic, ZstdMessages, plain_type
 from rigcal.sources.options import SourceOptions
-from rigcal.sources.rosbag1_index import MAGIC, Connection, Rosbag1Index
+from rigcal.sources.rosbag1_index import MAGIC, Rosbag1Index
 from rigcal.sources.rosbag2_sqlite import SIGNATURE, SqliteStore
 
 if TYPE_CHECKING:
@@ -62,50 +62,25 @@ def opened(path: Path, options: SourceOptions) -> Recording:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); mend its permissions.") from error
 
 
-class BagStore:
+class BagStore(ChannelStore):
     """The messages of a ROS 1 bag by topic; implements MessageStore."""
 
     def __init__(self, path: Path) -> None:
         """Index the bag; raises InputError."""
         self.path = path
-        self._index = Rosbag1Index(path)
-        if self._index.loss is not None:
-            logger.warning("{}: {}", path, self._index.loss)
-        groups: dict[str, list[Connection]] = {}
-        for connection in self._index.connections:
-            groups.setdefault(connection.topic, []).append(connection)
-        self._ids: dict[str, list[int]] = {}
-        self._firsts: dict[int, int] = {}  # number of a connection's first message among its topic's
-        self.topics: dict[str, Topic] = {}
-        for name, group in groups.items():
-            alike = [connection for connection in group if connection.type == group[0].type]
-            count = 0
-            for connection in alike:
-                self._firsts[connection.id] = count
-                count += len(self._index.log_times_ns(connection.id))
-            self._ids[name] = [connection.id for connection in alike]
-            self.topics[name] = Topic(name=name, type=plain_type(group[0].type), encoding="ros1", count=count)
-
-    def message(self, topic: str, index: int) -> bytes:
-        """A message's bytes; raises DamagedError where they are lost."""
-        connection = [key for key in self._ids[topic] if self._firsts[key] <= index][-1]
-        return self._index.message(connection, index - self._firsts[connection])
-
-    def heads(self, topics: Sequence[str], size: int) -> Iterator[Head]:
-        """The first bytes of every message of some topics."""
-        names = {key: topic for topic in topics for key in self._ids[topic]}
-        times = {key: self._index.log_times_ns(key) for key in names}
-        for part in self._index.parts(list(names), size):
-            yield Head(
-                topic=names[part.channel],
-                index=self._firsts[part.channel] + part.index,
-                log_time_ns=int(times[part.channel][part.index]),
-                data=part.data,
-            )
-
-    def span_ns(self) -> tuple[int, int] | None:
-        """When the first and the last message were logged; None without messages."""
-        return span_of([self._index.log_times_ns(connection) for connection in self._firsts])
+        index = Rosbag1Index(path)
+        if index.loss is not None:
+            logger.warning("{}: {}", path, index.loss)
+        types: dict[str, str] = {}  # of a topic's first publisher; others of that type are it, too
+        ids: dict[str, list[int]] = {}
+        for connection in index.connections:
+            if types.setdefault(connection.topic, connection.type) == connection.type:
+                ids.setdefault(connection.topic, []).append(connection.id)
+        super().__init__(index, ids)
+        self.topics: dict[str, Topic] = {
+            name: Topic(name=name, type=plain_type(kind), encoding="ros1", count=self.count(name))
+            for name, kind in types.items()
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

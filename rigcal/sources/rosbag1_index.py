@@ -10,17 +10,15 @@ is read like any other. Topics come from the records' headers: RealSense's own b
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 import numpy as np
-from loguru import logger
-from numpy.typing import NDArray
 
 from aruco.errors import InputError
-from rigcal.sources.chunked_file import NO_CHUNK, Chunk, ChunkedFile, IndexBuilder, Part, Read
+from rigcal.sources.chunked_file import NO_CHUNK, Chunk, ChunkedFile, IndexBuilder, Read, reader
 from rigcal.sources.decompression import MAX_CHUNK_BYTES, MAX_MESSAGE_BYTES, DamagedError
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -43,7 +41,7 @@ class Connection:
     type: str  # "sensor_msgs/Image"
 
 
-class Rosbag1Index:
+class Rosbag1Index(ChunkedFile):
     """Connections and messages of one ROS 1 bag. Nothing stays open; one chunk at most stays in memory."""
 
     def __init__(self, path: Path) -> None:
@@ -53,36 +51,11 @@ class Rosbag1Index:
             InputError: Not a bag, encrypted, damaged beyond use, or of absurd sizes.
         """
         walk = _Walk(path)
-        self.path = path
-        self._file = ChunkedFile(path, walk.index.chunks, _extent)
-        try:
-            with path.open("rb") as file:
-                walk.through(file)
-                for number in range(len(walk.index.chunks)):
-                    if walk.must_look_into(number):
-                        try:
-                            walk.look_into(self._file.contents(file, number), number)
-                        except DamagedError as error:
-                            logger.debug("{}: chunk {} is not indexed: {}", path, number, error)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error}); mend its permissions.") from error
-        except DamagedError as error:
-            raise InputError(f"{path}: {error}; record or copy the bag again.") from error
+        super().__init__(path, walk.index.chunks, _extent)
+        self.walk_through(walk, "bag")
         self.loss: str | None = walk.loss()  # how a bag ends that is cut off: "<file> ..."
         self.connections: tuple[Connection, ...] = tuple(walk.connections[key] for key in sorted(walk.connections))
-        self._file.places = {connection.id: walk.index.places(connection.id) for connection in self.connections}
-
-    def log_times_ns(self, connection: int) -> NDArray[np.int64]:
-        """(n,) when each message was logged, in the order in which they lie in the file."""
-        return self._file.places[connection].log_times_ns
-
-    def message(self, connection: int, index: int) -> bytes:
-        """The bytes of a connection's message; raises DamagedError where its chunk is lost."""
-        return self._file.message(connection, index)
-
-    def parts(self, connections: Sequence[int], size: int) -> Iterator[Part]:
-        """The first bytes of every message of some connections; see ChunkedFile.parts."""
-        return self._file.parts(connections, size)
+        self.places = {connection.id: walk.index.places(connection.id) for connection in self.connections}
 
 
 class _Walk:
@@ -104,7 +77,7 @@ class _Walk:
         if file.read(at) != MAGIC:
             raise InputError(f"{self._path}: is not a ROS 1 bag of version 2.0; convert older ones with rosbag fix.")
         while at < self._size:
-            record = _record(_file_read(file), at, self._size)
+            record = _record(reader(file), at, self._size)
             if record is None:
                 self._cut(file, at)
                 break
@@ -119,7 +92,7 @@ class _Walk:
 
     def must_look_into(self, chunk: int) -> bool:
         """Whether a chunk has no index, or its index names a connection that is not known yet."""
-        return chunk in self.index.unindexed or bool(self.index.users.get(chunk, set()) - self.connections.keys())
+        return self.index.must_look_into(chunk, self.connections)
 
     def look_into(self, data: memoryview, chunk: int) -> None:
         """Connections, and messages where there is no index, of those records of a chunk that are whole."""
@@ -136,12 +109,7 @@ class _Walk:
 
     def loss(self) -> str | None:
         """How the bag ends if it is cut off; completes "<file> ..."."""
-        if self._cut_at is None:
-            return None
-        return (
-            f"is cut off: the record at byte {self._cut_at} of {self._size} is not whole; "
-            f"the {self.index.span_s():.3f} s of messages before are used"
-        )
+        return None if self._cut_at is None else self.index.loss(self._cut_at, self._size)
 
     def _note(self, file: IO[bytes], at: int, fields: Mapping[bytes, bytes], data: int, end: int) -> None:
         op = _op(fields)
@@ -152,7 +120,7 @@ class _Walk:
         elif op == _INDEX:
             self._index(file, fields, data, end)
         elif op == _CONNECTION and end - data <= MAX_CONNECTION_BYTES:
-            self._connection(fields, _file_read(file)(data, end - data))
+            self._connection(fields, reader(file)(data, end - data))
         elif op == _MESSAGE:
             self._loose.setdefault(_number(fields, b"conn"), []).append((_time_ns(fields), at))
 
@@ -167,7 +135,7 @@ class _Walk:
         count = _number(fields, b"count")
         if count * _INDEX_ENTRY.itemsize != end - data:
             raise DamagedError(f"the index at byte {data} is damaged")
-        entries = np.frombuffer(_file_read(file)(data, end - data), dtype=_INDEX_ENTRY)
+        entries = np.frombuffer(reader(file)(data, end - data), dtype=_INDEX_ENTRY)
         times_ns = entries["s"].astype(np.int64) * 10**9 + entries["ns"]
         found = np.stack([times_ns, entries["offset"].astype(np.int64)], axis=1)
         self.index.index_last_chunk(_number(fields, b"conn"), found)
@@ -186,17 +154,9 @@ class _Walk:
         """The bag ends within the record here; a chunk is kept as far as it goes."""
         self._cut_at = at
         self.index.settle(whole=False)
-        head = _record(_file_read(file), at, self._size, cut=True)
+        head = _record(reader(file), at, self._size, cut=True)
         if head is not None and _op(head[0]) == _CHUNK:
             self._chunk(head[0], head[1], self._size, cut=True)
-
-
-def _file_read(file: IO[bytes]) -> Read:
-    def read(at: int, size: int) -> bytes:
-        file.seek(at)
-        return file.read(size)
-
-    return read
 
 
 def _record(read: Read, at: int, end: int, *, cut: bool = False) -> tuple[Mapping[bytes, bytes], int, int] | None:
