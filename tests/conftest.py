@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -46,3 +47,22 @@ def _quiet_log():
     logger.remove()
     yield
     logger.remove()
+
+
+@pytest.fixture
+def said(_quiet_log: None) -> Iterator[list[str]]:
+    """Warnings, as the user reads them."""
+    yield from _heard("WARNING")
+
+
+@pytest.fixture
+def told(_quiet_log: None) -> Iterator[list[str]]:
+    """Warnings, and what else the user reads."""
+    yield from _heard("INFO")
+
+
+def _heard(level: str) -> Iterator[list[str]]:
+    lines: list[str] = []
+    handle = logger.add(lambda message: lines.append(message.record["message"]), level=level)
+    yield lines
+    logger.remove(handle)

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loguru import logger
 from numpy.typing import NDArray
 
 from aruco.errors import InputError, MissingExtraError
@@ -73,14 +72,6 @@ def rgbd(path: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def write(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, Source], Path]:
     return lambda path, source: rgbd(path, source, monkeypatch)
-
-
-@pytest.fixture
-def said() -> Iterator[list[str]]:
-    lines: list[str] = []
-    sink = logger.add(lambda message: lines.append(message.record["message"]), level="WARNING")
-    yield lines
-    logger.remove(sink)
 
 
 # Joining

@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from loguru import logger
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
@@ -83,14 +82,6 @@ def convert(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Converted]:
         return convert_recording([Path("somewhere")], out, **more)
 
     return run
-
-
-@pytest.fixture
-def said() -> Iterator[list[str]]:
-    lines: list[str] = []
-    sink = logger.add(lambda message: lines.append(message.record["message"]), level="INFO")
-    yield lines
-    logger.remove(sink)
 
 
 class StopAfter:
@@ -176,13 +167,13 @@ def test_every_nth_moment_keeps_cameras_together(convert: Callable[..., Converte
 
 @pytest.mark.parametrize("name", ["out", "out.mcap"])
 def test_a_bad_frame_is_left_out_and_counted(
-    convert: Callable[..., Converted], tmp_path: Path, name: str, said: list[str]
+    convert: Callable[..., Converted], tmp_path: Path, name: str, told: list[str]
 ) -> None:
     source = Source(bad=(2, 5))
     converted = convert(source, tmp_path / name)
     assert (converted.written, converted.bad) == (10, 2)
     assert "2 could not be read" in converted.sentence
-    assert sum("is torn" in line for line in said) == 2
+    assert sum("is torn" in line for line in told) == 2
     assert_same(open_recordings([tmp_path / name]), source, skip=(2, 5))
 
 
@@ -192,16 +183,16 @@ def test_a_bad_frame_is_left_out_and_counted(
 @pytest.mark.parametrize("steps", [1, 5, 12])
 @pytest.mark.parametrize("name", ["out", "out.mcap"])
 def test_a_second_run_goes_on_where_the_first_stopped(
-    convert: Callable[..., Converted], tmp_path: Path, name: str, steps: int, said: list[str]
+    convert: Callable[..., Converted], tmp_path: Path, name: str, steps: int, told: list[str]
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         convert(Source(), tmp_path / name, progress=StopAfter(steps))
-    assert any(f"{steps} finished frames are kept" in line for line in said)
+    assert any(f"{steps} finished frames are kept" in line for line in told)
     assert not (tmp_path / name).exists()
     source = Source()
     converted = convert(source, tmp_path / name)
     assert (converted.written, converted.kept) == (12, steps)
-    assert any(f"finished {steps} of 12 frames; going on" in line for line in said)
+    assert any(f"finished {steps} of 12 frames; going on" in line for line in told)
     assert len(source.reads) == 12 - steps + 2  # and the first of each camera, to know the recording by
     convert(Source(), tmp_path / f"whole_{name}")
     if name == "out.mcap":
@@ -502,11 +493,11 @@ def test_a_recording_without_a_readable_frame_is_refused_and_leaves_nothing(
 
 @pytest.mark.parametrize("name", ["out", "out.mcap"])
 def test_a_camera_that_ends_without_a_frame_is_named(
-    convert: Callable[..., Converted], tmp_path: Path, name: str, said: list[str]
+    convert: Callable[..., Converted], tmp_path: Path, name: str, told: list[str]
 ) -> None:
     converted = convert(Source(bad=range(8)), tmp_path / name)
     assert (converted.cameras, converted.written, converted.bad) == (1, 4, 8)
-    assert "of a camera no frame was written: 1234" in said
+    assert "of a camera no frame was written: 1234" in told
 
 
 def test_a_camera_name_that_no_folder_can_have_is_refused_before_anything_is_made(
@@ -537,7 +528,7 @@ def test_where_nothing_was_finished_nothing_is_left_and_nothing_promised(
 
 
 def test_frames_that_are_not_whole_are_written_again(
-    convert: Callable[..., Converted], tmp_path: Path, said: list[str]
+    convert: Callable[..., Converted], tmp_path: Path, told: list[str]
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         convert(Source(), tmp_path / "out", progress=StopAfter(12))
@@ -548,7 +539,7 @@ def test_frames_that_are_not_whole_are_written_again(
     images[2].write_bytes(bytes(images[2].stat().st_size))
     depths[3].write_bytes(depths[3].read_bytes()[:100])
     assert convert(Source(), tmp_path / "out").kept == 12 - 4
-    assert any("4 frames are not whole" in line for line in said)
+    assert any("4 frames are not whole" in line for line in told)
     assert_same(RgbdFolder(tmp_path / "out"), Source())
 
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_writers import SIZE, Message, Ros, pictures, write_mcap
-from loguru import logger
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 
@@ -24,15 +23,6 @@ from rigcal.sources.mcap_index import DamagedError, McapIndex
 COMPRESSIONS = ["NONE", "LZ4", "ZSTD"]
 SIZE_BYTES = 3000
 N = 60
-
-
-@pytest.fixture
-def said() -> Iterator[list[str]]:
-    """Warnings, as the user reads them."""
-    found: list[str] = []
-    handle = logger.add(lambda message: found.append(message.record["message"]), level="WARNING")
-    yield found
-    logger.remove(handle)
 
 
 def payload(k: int) -> bytes:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_writers import SIZE, K, Message, Ros, pictures, write_bag1, write_bag2
-from loguru import logger
 
 from aruco.errors import InputError
 from aruco.model import Frame
@@ -31,15 +30,6 @@ HERE = (0.0, 0.0, 0.0)
 COLOUR = (0.0149, 0.0001, 0.0003)  # where the colour sensor of a D435 stands, metres
 UNIT = 0.0001  # of an L515 or of short-range settings
 STREAMS = {"Depth_0": "sensor_0", "Infrared_1": "sensor_0", "Infrared_2": "sensor_0", "Color_0": "sensor_1"}
-
-
-@pytest.fixture
-def said() -> Iterator[list[str]]:
-    """Warnings, as the user reads them."""
-    found: list[str] = []
-    handle = logger.add(lambda message: found.append(message.record["message"]), level="WARNING")
-    yield found
-    logger.remove(handle)
 
 
 def static(

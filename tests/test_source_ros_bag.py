@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_writers import KINDS, SIZE, K, Message, Ros, pictures, write, write_bag1, write_bag2, write_mcap
-from loguru import logger
 from numpy.typing import NDArray
 
 from aruco.errors import InputError
@@ -38,15 +37,6 @@ def rig(ros: Ros, n: int = N, camera: str = "/front") -> Iterator[Message]:
         if k < n - 1:
             yield ros.info(f"{camera}/aligned_depth_to_color/camera_info", stamp)
             yield ros.image(f"{camera}/aligned_depth_to_color/image_raw", stamp + 1000, DEPTHS[k], "16UC1")
-
-
-@pytest.fixture
-def said() -> Iterator[list[str]]:
-    """Warnings, as the user reads them."""
-    found: list[str] = []
-    handle = logger.add(lambda message: found.append(message.record["message"]), level="WARNING")
-    yield found
-    logger.remove(handle)
 
 
 def frames(recording: Recording, camera: str = "front", *, depth: bool = False) -> list[Frame | BadFrame]:

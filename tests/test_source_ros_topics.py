@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_writers import SIZE, K, Message, Ros, pictures, write_mcap
-from loguru import logger
 
 from aruco.errors import InputError
 from aruco.model import BadFrame, Camera, Frame
@@ -18,15 +17,6 @@ from rigcal.sources.options import SourceOptions
 from rigcal.sources.ros_topics import CameraTopics, First, paired
 
 IMAGE, COMPRESSED, INFO = "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo"
-
-
-@pytest.fixture
-def said() -> Iterator[list[str]]:
-    """What the user reads."""
-    found: list[str] = []
-    handle = logger.add(lambda message: found.append(message.record["message"]), level="INFO")
-    yield found
-    logger.remove(handle)
 
 
 def cameras(rows: Sequence[tuple[str, str, str]], given: Sequence[str] = ()) -> dict[str, CameraTopics]:
@@ -100,17 +90,17 @@ def test_realsense_driver():
     assert not camera.is_rectified
 
 
-def test_realsense_driver_without_aligned_depth(said: list[str]):
+def test_realsense_driver_without_aligned_depth(told: list[str]):
     camera = cameras([row for row in REALSENSE if "aligned" not in row[0]])["camera"]
     assert camera.depth is None
     assert any(
         "depth /camera/camera/depth/image_rect_raw is left out, it is not in the image's frame 'color_optical'; record "
         "depth that is aligned" in line
-        for line in said
+        for line in told
     )
 
 
-def test_zed_driver(said: list[str]):
+def test_zed_driver(told: list[str]):
     found = cameras(ZED)
     assert list(found) == ["zed"]
     camera = found["zed"]
@@ -119,7 +109,7 @@ def test_zed_driver(said: list[str]):
     assert camera.depth == "/zed/zed_node/depth/depth_registered"
     assert camera.confidence == "/zed/zed_node/confidence/confidence_map"
     assert camera.right_info == "/zed/zed_node/right/camera_info"
-    assert any("of one camera's images /zed/zed_node/left/image_rect_color is taken, not" in line for line in said)
+    assert any("of one camera's images /zed/zed_node/left/image_rect_color is taken, not" in line for line in told)
 
 
 def test_newer_zed_driver():
@@ -332,20 +322,20 @@ def test_intrinsics_may_come_from_a_file(tmp_path: Path):
     np.testing.assert_array_equal(found["cam"].K, K)
 
 
-def test_a_camera_without_camera_info_is_left_out_beside_others(tmp_path: Path, said: list[str]):
+def test_a_camera_without_camera_info_is_left_out_beside_others(tmp_path: Path, told: list[str]):
     ros = Ros(2)
     messages = [*images(ros, "/a/image_raw"), ros.info("/a/camera_info"), *images(ros, "/b/image_raw")]
     assert sorted(opened(tmp_path, messages)) == ["a"]
-    assert any("/b/image_raw is left out, it has no CameraInfo" in line for line in said)
+    assert any("/b/image_raw is left out, it has no CameraInfo" in line for line in told)
 
 
-def test_intrinsics_that_change_are_told(tmp_path: Path, said: list[str]):
+def test_intrinsics_that_change_are_told(tmp_path: Path, told: list[str]):
     ros = Ros(2)
     other = K.copy()
     other[0, 0] += 1
     infos = [ros.info("/cam/camera_info", 10**9), ros.info("/cam/camera_info", 2 * 10**9, k=other)]
     np.testing.assert_array_equal(opened(tmp_path, [*images(ros), *infos])["cam"].K, K)
-    assert any("/cam/camera_info changes during the recording; the first is used" in line for line in said)
+    assert any("/cam/camera_info changes during the recording; the first is used" in line for line in told)
 
 
 @pytest.mark.parametrize("name", ["..", "a/b", "../x"])

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 from conftest import SHARED_DATA
-from loguru import logger
 from svo2_writer import LEFT, RIGHT, SIZE, T_right_left, conf_text, eyes
 
 from aruco.errors import InputError
@@ -52,13 +51,6 @@ RZ_HD=-0.00194124
 @pytest.fixture(autouse=True)
 def _no_sdk_folders(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zed_conf, "USUAL_FOLDERS", ())
-
-
-@pytest.fixture
-def warned() -> list[str]:
-    lines: list[str] = []
-    logger.add(lines.append, level="WARNING", format="{message}")
-    return lines
 
 
 def _written(folder: Path, text: str, name: str = "SN1010.conf") -> Path:
@@ -234,10 +226,10 @@ def test_a_file_of_another_camera_is_refused(tmp_path: Path) -> None:
     assert find_conf("1010", path, tmp_path) == beside
 
 
-def test_a_file_without_a_serial_number_is_taken_and_told(tmp_path: Path, warned: list[str]) -> None:
+def test_a_file_without_a_serial_number_is_taken_and_told(tmp_path: Path, said: list[str]) -> None:
     path = _written(tmp_path, conf_text(), "mine.conf")
     assert find_conf("1010", path, tmp_path / "other") == path
-    assert any("does not say whose" in line for line in warned)
+    assert any("does not say whose" in line for line in said)
 
 
 def test_a_file_without_a_serial_number_is_not_that_of_two_cameras(tmp_path: Path) -> None:
