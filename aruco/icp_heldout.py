@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from aruco.icp_equations import weighted
-from aruco.icp_normal import Normal, derivatives, scaled_inverse, summed
+from aruco.icp_normal import Normal, derivatives, free_inverse, scaled_inverse, summed
 from aruco.icp_rows import POSE, Index, Rows
 from aruco.icp_solve import Registration
 from aruco.pose_math import Array
@@ -175,9 +175,7 @@ def held_out_by(registration: Registration, patch: Index, fold: Index) -> HeldOu
 
 def _estimate(registration: Registration, normal: Normal) -> Estimate:
     """The best of all unknowns but those that are frozen."""
-    free = np.flatnonzero(~registration.frozen)
-    P = np.zeros_like(normal.H)
-    P[np.ix_(free, free)] = scaled_inverse(normal.H[np.ix_(free, free)])
+    P = free_inverse(normal.H, registration.frozen)
     return Estimate(x=-P @ normal.g, P=P)
 
 

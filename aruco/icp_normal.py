@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from aruco.floor_plane import Mask
 from aruco.icp_rows import PER_CAMERA, Layout, Rows
 from aruco.pose_math import Array
 
@@ -91,6 +92,14 @@ def derivatives(rows: Rows, layout: Layout) -> csr_array:
 def solved(normal: Normal, M: Array) -> Array:
     """(size,) the best ``x = M z`` over all z."""
     return -M @ (scaled_inverse(M.T @ normal.H @ M) @ (M.T @ normal.g))
+
+
+def free_inverse(A: Array, frozen: Mask) -> Array:
+    """(size, size) the inverse of a symmetric matrix over unknowns that are not frozen (size,); zero at those."""
+    free = np.ix_(~frozen, ~frozen)
+    inverse = np.zeros_like(A)
+    inverse[free] = scaled_inverse(A[free])
+    return inverse
 
 
 def scaled_inverse(A: Array) -> Array:

@@ -21,7 +21,7 @@ from aruco.floor_plane import FloorPlane, Mask
 from aruco.icp_cloud import Cloud
 from aruco.icp_information import PairInformation, fit_of, pair_information, unobserved
 from aruco.icp_match import Matches
-from aruco.icp_normal import Normal, scaled_inverse
+from aruco.icp_normal import Normal, free_inverse
 from aruco.icp_placing import placed
 from aruco.icp_prior import Prior, Scales
 from aruco.icp_rows import Layout, Rows
@@ -123,7 +123,7 @@ def _answer(
 ) -> Registration:
     layout, reference, T = setup.layout, setup.reference, fit.state.T_world_cam
     prior = setup.known.normal(fit.state, fit.scales)
-    joint = setup.M @ scaled_inverse(setup.M.T @ (fit.clouds.H + prior.H) @ setup.M) @ setup.M.T
+    joint = free_inverse(fit.clouds.H + prior.H, setup.frozen)
     T_restored = setup.start.T_world_cam[reference] @ invert_transform(T[reference])
     T_out_own = invert_transform(setup.T_own_world) @ T_restored
     return Registration(

@@ -51,7 +51,6 @@ class Setup:
     begin: State  # where the way begins: at the start, but for cameras that are thought to stand elsewhere
     T_own_world: Pose
     frozen: Mask  # (size,) unknowns that are not estimated
-    M: Array  # (size, k) all unknowns by the free ones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,7 +113,6 @@ def set_up(
         begin=replace(at_start, T_world_cam={**at_start.T_world_cam, **elsewhere}),
         T_own_world=T_own_world,
         frozen=frozen,
-        M=np.eye(layout.size)[:, ~frozen],
     )
 
 
@@ -185,7 +183,7 @@ def _met(setup: Setup, state: State, scales: Scales, *, scale: int) -> Fit:
 
 def _stepped(setup: Setup, fit: Fit) -> tuple[State, Scales, float]:
     """The best state of the linear equations, by what scales, and how far it is in standard deviations."""
-    M = setup.M
+    M = np.eye(setup.layout.size)[:, ~setup.frozen]  # all unknowns by the free ones
     scales = told_scales(setup.known, fit.state, fit.clouds, M, fit.scales)
     total = fit.clouds + setup.known.normal(fit.state, scales)
     x = solved(total, M)

@@ -70,9 +70,9 @@ def levelled(rig: Path, store: Path, out: Path, *more: object, code: int = 0) ->
     return json.loads(out.read_text())
 
 
-def assert_one_sentence(result: Result, *words: str) -> None:
-    """An error as promised: exit code 1, no traceback, the words that help, and not a page of text."""
-    assert result.exit_code == 1, result.output
+def assert_one_sentence(result: Result, *words: str, code: int = 1) -> None:
+    """An error as promised: its code, no traceback, the words that help, and not a page of text."""
+    assert result.exit_code == code, result.output
     assert result.exception is None or isinstance(result.exception, SystemExit)
     assert "Traceback" not in result.output
     errors = [line for line in result.output.splitlines() if line.startswith("Error:")]

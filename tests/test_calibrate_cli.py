@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner, Result
+from level_runs import assert_one_sentence
 
 from aruco.board import board_text
 from aruco.marker_geometry import SHIPPED_MAPS, load_faces
@@ -46,17 +47,6 @@ def copy(demo_folder: Path, tmp_path: Path) -> Path:
 def images(recording: Path, camera: int) -> list[Path]:
     folder = sorted(p for p in recording.iterdir() if p.is_dir())[camera] / "image"
     return sorted(folder.iterdir())
-
-
-def assert_one_sentence(result: Result, *words: str, code: int = 1) -> None:
-    """An error as promised: its code, no traceback, the words that help, and not a page of text."""
-    assert result.exit_code == code, result.output
-    assert result.exception is None or isinstance(result.exception, SystemExit)
-    assert "Traceback" not in result.output
-    errors = [line for line in result.output.splitlines() if line.startswith("Error:")]
-    assert len(errors) == 1, result.output
-    for word in words:
-        assert word in errors[0], f"{word!r} not in {errors[0]!r}"
 
 
 def test_poses_agree_with_the_truth_and_up_is_up(demo: Simulation, demo_folder: Path, tmp_path: Path) -> None:

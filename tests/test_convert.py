@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from format_rigs import worst_pose_difference
+from level_runs import assert_one_sentence
 
 from aruco.errors import InputError
 from aruco.pose_math import invert_transform
@@ -27,16 +28,6 @@ WITH_LENSES = ("kalibr", "colmap", "nerfstudio", "aniposelib", "open3d")
 
 def convert(*arguments: object) -> Result:
     return CliRunner().invoke(main, ["convert", *(str(argument) for argument in arguments)])
-
-
-def assert_one_sentence(result: Result, *words: str, code: int = 1) -> None:
-    assert result.exit_code == code, result.output
-    assert result.exception is None or isinstance(result.exception, SystemExit)
-    assert "Traceback" not in result.output
-    errors = [line for line in result.output.splitlines() if line.startswith("Error:")]
-    assert len(errors) == 1, result.output
-    for word in words:
-        assert word in errors[0], f"{word!r} not in {errors[0]!r}"
 
 
 def out_of(name: str, folder: Path) -> Path:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from level_runs import assert_one_sentence
 
 from aruco.depth_save import load_depth_data
 from aruco.marker_geometry import save_faces
@@ -57,13 +58,6 @@ def plain(recording: Path, out: Path, *more: object) -> Result:
 
 def meta(path: Path) -> dict[str, Any]:
     return read_json(path)["_meta"]
-
-
-def assert_one_sentence(result: Result, *words: str, code: int = 1) -> None:
-    assert result.exit_code == code, result.output
-    errors = [line for line in result.output.splitlines() if line.startswith("Error:")]
-    assert len(errors) == 1, result.output
-    assert all(word in errors[0] for word in words), errors[0]
 
 
 def test_without_depth_options_depth_is_not_looked_at(recording: Path, tmp_path: Path) -> None:
