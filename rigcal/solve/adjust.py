@@ -56,6 +56,10 @@ class Gauge:
     fixed_cameras: NDArray[np.bool_]  # (c,)
     fixed_frames: NDArray[np.bool_]  # (f,)
 
+    def without_frames(self) -> Gauge:
+        """The same cameras, and no frame: what is left tells relative poses only."""
+        return Gauge(self.fixed_cameras, np.zeros_like(self.fixed_frames))
+
 
 Unknowns = TypeVar("Unknowns")
 
@@ -285,7 +289,7 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
     """
     system = view_sums(sightings, poses, kappa, power=2)
     H_cam, _, H_target, _, E = blocks(sightings, system)
-    S, Y = schur(H_cam, inverse_targets(H_target, gauge), E)
+    S, _ = schur(H_cam, inverse_targets(H_target, gauge), E)
     free = np.repeat(~gauge.fixed_cameras, 6)
     P = np.zeros_like(S)
     if free.any():
@@ -294,6 +298,7 @@ def _covariance(sightings: Sightings, poses: Poses, gauge: Gauge, kappa: float) 
     variance = residual_variance(system.squares, degrees_of_freedom(sightings, gauge), kappa)
     W, g = by_frame(sightings, system.W), by_frame(sightings, view_sums(sightings, poses, kappa).g)
     place, held = places(poses.T_world_target), bool(gauge.fixed_frames.any())
+    Y = E @ inverse_targets(H_target, gauge.without_frames())
     variance *= repetition(W, g, E, Y, P, variance, place, frame_held=held)
     return variance * P, variance
 

@@ -10,6 +10,12 @@ eliminated, then has a larger spread than the normal equations promise: ``sum s_
 P = S^-1, and p the number of unknowns. That is the trace of the sandwich covariance clustered by places (Liang and
 Zeger, "Longitudinal data analysis using generalized linear models", 1986), with each cluster's leverage taken out
 exactly.
+
+Places can only disagree about where cameras are relative to each other. Where the target of one frame carries the
+world, that frame alone says where all of them together are in it: six unknowns without a witness, which take no part.
+So its target is eliminated here like any other, S_k is what it adds about relative poses, and p has six less. Nothing
+else changes: with N the common twist, ``S_k N = 0`` and ``P S N = N``, so the full S_k of that frame would only have
+six more of tr (S_k P)^2. A single camera has no relative pose, hence no factor.
 """
 
 from __future__ import annotations
@@ -56,12 +62,15 @@ def repetition(
         W: (f, c, 6, 6) what every view adds to the normal equations, zero where there is none.
         g: (f, c, 6) every view's gradient, for the target's twist, at the optimum.
         E: (f, 6c, 6) coupling of cameras and targets.
-        Y: (f, 6c, 6) E times the inverses of the targets' blocks.
+        Y: (f, 6c, 6) E times the inverses of the targets' blocks, also of a target that carries the world.
         P: (6c, 6c) inverse of the cameras' system, zero for fixed ones.
         variance: Of a residual coordinate.
         place: (f,) frames with equal numbers may repeat each other.
-        frame_held: Whether the target of one frame carries the world: six of the unknowns are then its alone.
+        frame_held: Whether the target of one frame carries the world, rather than cameras do.
     """
+    n_free = 6 * (np.count_nonzero(P.any(axis=1).reshape(-1, 6).any(axis=1)) - frame_held)
+    if n_free <= 0:  # pull and leverage would be rounding errors, and so would be their ratio
+        return 1.0
     n_place = int(place.max(initial=-1)) + 1
     scores = np.zeros((n_place, P.shape[0]))
     np.add.at(scores, place, -g.reshape(len(g), -1))
@@ -69,8 +78,7 @@ def repetition(
     step = max(1, -(-n_place // MAX_PLACES))
     some = (np.flatnonzero(place == k) for k in range(0, n_place, step))
     leverage = sum(_squared_leverage(W[f], E[f], Y[f], P) for f in some) * step
-    n_free = 6 * np.count_nonzero(P.any(axis=1).reshape(-1, 6).any(axis=1))
-    if n_free - leverage <= MIN_INDEPENDENT * (n_free - 6 * frame_held):
+    if n_free - leverage <= MIN_INDEPENDENT * n_free:
         return 1.0
     return max(1.0, pull / (variance * (n_free - leverage)))
 

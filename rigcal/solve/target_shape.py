@@ -288,14 +288,14 @@ class ShapeProblem:
         """(6 (c + m), 6 (c + m)) of cameras and markers, as adjust's; zero for what does not move."""
         sums = self.sums(unknowns, kappa, power=2)
         normal = self.normal(unknowns, sums)
-        S, Y = self._reduced(normal, normal.H, solver.inverse_targets(normal.H_target, self.gauge))
+        S, _ = self._reduced(normal, normal.H, solver.inverse_targets(normal.H_target, self.gauge))
         basis = self.basis(unknowns)
         covariance = basis @ np.linalg.inv(basis.T @ S @ basis) @ basis.T
         variance = solver.residual_variance(sums.squares, self.dof, kappa)
-        variance *= self._repetition(unknowns, normal, S, Y, self.sums(unknowns, kappa).g, variance)
+        variance *= self._repetition(unknowns, normal, S, self.sums(unknowns, kappa).g, variance)
         return variance * (covariance + covariance.T) / 2
 
-    def _repetition(self, unknowns: Shape, normal: _Normal, S: Array, Y: Array, g: Array, variance: float) -> float:
+    def _repetition(self, unknowns: Shape, normal: _Normal, S: Array, g: Array, variance: float) -> float:
         """How much corners of one frame repeat each other in what they say about the cameras."""
         rows, n_cam, n_frame = self.rows, len(self.rows.cameras), len(self.rows.frames)
         cameras = slice(0, 6 * n_cam)
@@ -306,7 +306,8 @@ class ShapeProblem:
         g_frame_cam = _summed(g, rows.view_frame * n_cam + rows.view_camera, n_frame * n_cam)
         W, g = -E.reshape(n_frame, n_cam, 6, 6), g_frame_cam.reshape(n_frame, n_cam, 6)
         place, held = places(unknowns.poses.T_world_target), bool(self.gauge.fixed_frames.any())
-        return repetition(W, g, E, Y[:, cameras], P, variance, place, frame_held=held)
+        Y = E @ solver.inverse_targets(normal.H_target, self.gauge.without_frames())
+        return repetition(W, g, E, Y, P, variance, place, frame_held=held)
 
     def parts(self, poses: Poses) -> NDArray[np.int64]:
         """Which part of the target every marker (m,) belongs to; -1 for points and for markers that are tied to none.
