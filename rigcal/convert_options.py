@@ -14,7 +14,8 @@ from typing import Any, Literal, TypeVar
 import click
 from click.core import ParameterSource
 
-from rigcal.formats.registry import NAMES
+from aruco.errors import OutputError
+from rigcal.formats.registry import NAMES, format_of
 from rigcal.source_options import source_options
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -45,7 +46,7 @@ _OPTIONS = (
                  help="ros2-launch, urdf: the frame that the poses are given in. Default: world."),
     click.option("--frame-name", metavar="PATTERN",
                  help="ros2-launch, urdf: a camera's frame, with {camera} for its name. Default: "
-                      "{camera}_left_camera_optical_frame, as ZED's wrapper has it."),
+                      "{camera}_left_camera_optical_frame, as ZED's wrapper before 5.1 has it."),
     click.option("--image-name", metavar="PATTERN",
                  help="colmap, nerfstudio: a camera's image, with {camera} for its name. Default: {camera}.png, "
                       "{camera}/image.png for colmap."),
@@ -137,6 +138,17 @@ def export_choices(given: Mapping[str, Any], takes: frozenset[str]) -> dict[str,
 
 
 def inputs_and_output(given: Mapping[str, Any]) -> tuple[list[Path], Path]:
-    """What is converted, and where to: -o, or the last argument."""
+    """What is converted, and where to: -o, or the last argument.
+
+    Raises:
+        OutputError: The last argument is a calibration that would be replaced: ``*.json`` may stand for two inputs.
+    """
     paths = list(given["paths"])
-    return (paths, given["output"]) if given["output"] else (paths[:-1], paths[-1])
+    if given["output"]:
+        return paths, given["output"]
+    if given["to"] and format_of(paths[-1]) == given["to"]:
+        raise OutputError(
+            f"{paths[-1]}: is a calibration already ({given['to']}), and may be meant as another input; to replace it, "
+            f"give it as the output: -o {paths[-1]}."
+        )
+    return paths[:-1], paths[-1]

@@ -1,6 +1,6 @@
 """The story of ``rigcal convert CALIBRATION --to FORMAT``: read, add intrinsics, check, write.
 
-Owns      its order, which intrinsics belong to which camera, refusing to write over what is read.
+Owns      its order, which intrinsics belong to which camera, refusing to write over what is read or another's.
 Leaves    formats to rigcal.formats, recordings to rigcal.sources.
 """
 
@@ -18,9 +18,13 @@ from aruco.model import Camera
 from rigcal import cli
 from rigcal.formats import registry
 from rigcal.formats.rig import ExportOptions, Format, Rig, listed
-from rigcal.recordings import read_cameras
+from rigcal.recordings import plain_options, read_cameras
 from rigcal.sources import open_recordings
 from rigcal.sources.options import SourceOptions
+
+# What helps where intrinsics are of none of the calibration's cameras.
+_GIVE_ITS_RECORDING = "give the recording that the calibration was made from"
+_RENAME = "rename the camera there; where it is called like its file, rename the file"
 
 
 def export(
@@ -47,21 +51,28 @@ def export(
 
     Raises:
         InputError: Something cannot be read, or the format cannot hold it.
-        OutputError: The output cannot be written, or is an input.
+        OutputError: The output cannot be written, is an input, or nothing that this conversion wrote earlier.
     """
-    intrinsics = source_options.intrinsics if source_options else None
-    zed_conf = source_options.zed_conf if source_options else None
-    _refuse_inputs(out, [calibration, *filter(None, (options.into, intrinsics, zed_conf))], recordings)
+    given = source_options or plain_options()
+    _refuse_to_replace(
+        out, to, [calibration, *filter(None, (options.into, given.intrinsics, given.zed_conf))], recordings
+    )
     cli.refuse_inputs(out, recordings, None)
     rig = _read(calibration)
-    if intrinsics:
-        rig = _with_cameras(rig, read_cameras(intrinsics), str(intrinsics))
+    if given.intrinsics:
+        rig = _with_cameras(rig, read_cameras(given.intrinsics), str(given.intrinsics), _RENAME)
     if recordings:
-        cameras = {camera.name: camera for camera in open_recordings(recordings, source_options).cameras}
-        rig = _with_cameras(rig, cameras, listed(str(path) for path in recordings))
+        cameras = _recorded_cameras(out, recordings, given)
+        rig = _with_cameras(rig, cameras, listed(str(path) for path in recordings), _GIVE_ITS_RECORDING)
     to.write(rig, out, options)
+    return f"{_written(rig, out, options)}\n{to.name}: {to.explain}"
+
+
+def _written(rig: Rig, out: Path, options: ExportOptions) -> str:
+    if options.into is not None:
+        return f"Wrote {out}: {options.into} with new poses for its cameras that the calibration has."
     count = len(rig.T_world_cam)
-    return f"Wrote {count} camera{'s' if count > 1 else ''} to {out}.\n{to.name}: {to.explain}"
+    return f"Wrote {count} camera{'s' if count > 1 else ''} to {out}."
 
 
 def _read(calibration: Path) -> Rig:
@@ -79,44 +90,66 @@ def refuse_calibration(path: Path) -> None:
     """
     if not path.is_file():
         return
-    try:
-        known = registry.detect(path)
-    except InputError:
-        return
-    raise InputError(
-        f"{path}: is a calibration ({known.name}), and no format was given to convert it to; add --to FORMAT -o OUT."
-    )
+    if (known := registry.format_of(path)) is not None:
+        raise InputError(
+            f"{path}: is a calibration ({known}), and no format was given to convert it to; add --to FORMAT -o OUT."
+        )
 
 
-def _with_cameras(rig: Rig, cameras: Mapping[str, Camera], where: str) -> Rig:
+def _recorded_cameras(out: Path, recordings: Sequence[Path], options: SourceOptions) -> Mapping[str, Camera]:
+    """The cameras of recordings.
+
+    Raises:
+        OutputError: A reader looked for intrinsics in what the output would replace.
+    """
+    asked: list[Path] = []
+
+    def noted(path: Path) -> Mapping[str, Camera]:
+        asked.append(path)
+        return options.read_cameras(path)
+
+    found = open_recordings(recordings, replace(options, read_cameras=noted)).cameras
+    if _is_input(out, asked):
+        raise OutputError(f"{out}: is an input, where the recording's intrinsics are; choose another name.")
+    return {camera.name: camera for camera in found}
+
+
+def _with_cameras(rig: Rig, cameras: Mapping[str, Camera], where: str, cure: str) -> Rig:
     """The rig with intrinsics from elsewhere, which know better than the calibration file."""
     ours = {name: camera for name, camera in cameras.items() if name in rig.T_world_cam}
     if not ours:
         raise InputError(
-            f"{where}: has camera {listed(cameras)}, and the calibration {listed(rig.T_world_cam)}; give the recording "
-            "that the calibration was made from."
+            f"{where}: has camera {listed(cameras)}, and the calibration {listed(rig.T_world_cam)}; {cure}."
         )
     if missing := rig.T_world_cam.keys() - ours.keys() - rig.cameras.keys():
         logger.warning("{}: has no camera {}, whose intrinsics stay unknown", where, listed(missing))
     return replace(rig, cameras={**rig.cameras, **ours})
 
 
-def _refuse_inputs(out: Path, inputs: Sequence[Path], recordings: Sequence[Path]) -> None:
-    """See that writing touches no input: not with the output, nor with what stands beside it in the meantime.
+def _refuse_to_replace(out: Path, to: Format, inputs: Sequence[Path], recordings: Sequence[Path]) -> None:
+    """See that writing replaces no input, no calibration in another format, and in recordings nothing but its own.
 
     Raises:
         OutputError: It would, or nobody can tell.
     """
-    goal = out.resolve()
-    # Of the last two, see aruco.atomic and whole_folder: they stand there until the output is whole.
-    touched = [out, goal, Path(f"{goal}.part"), Path(f"{goal}.old")]
     try:
-        hit = next((path for path in touched if _is_input(path, inputs) or _is_recorded(path, recordings)), None)
+        if _is_input(out, inputs):
+            raise OutputError(f"{out}: is an input; choose another name for the output.")
+        there = registry.format_of(out)
+        if there == to.name:
+            return
+        if there is not None:
+            raise OutputError(
+                f"{out}: is a calibration in another format ({there}), which {to.name} does not replace; remove it "
+                "or choose another name for the output."
+            )
+        if _is_recorded(out, recordings):
+            raise OutputError(
+                f"{out}: lies in a recording that is given, or beside it, where only an earlier {to.name} output is "
+                "replaced; choose another name for the output."
+            )
     except OSError as error:
         raise OutputError(f"{out}: cannot be looked at ({error.strerror or error}); choose another place.") from error
-    if hit is not None:
-        name = out if hit in (out, goal) else f"{out}: {hit.name}, which is replaced on the way"
-        raise OutputError(f"{name}: is an input; choose another name for the output.")
 
 
 def _is_input(path: Path, inputs: Sequence[Path]) -> bool:

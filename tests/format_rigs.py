@@ -47,7 +47,8 @@ def format_rig(kinds: Mapping[str, str], up: UpAxis | None = "+y") -> Rig:
         poses[name] = make_pose(R, t)
     if up == "-y":
         poses = {name: np.diag([1.0, -1.0, -1.0, 1.0]) @ T for name, T in poses.items()}
-    return Rig(T_world_cam=poses, up=up, cameras={name: lens(name, kind) for name, kind in kinds.items()})
+    cameras = {name: lens(name, kind) for name, kind in kinds.items()}
+    return Rig(T_world_cam=poses, up=up, origin="target", cameras=cameras)
 
 
 def points_before(rig: Rig, name: str, n: int = 50) -> np.ndarray:

@@ -16,6 +16,7 @@ from format_rigs import worst_pose_difference
 from level_runs import assert_one_sentence
 
 from aruco.errors import InputError
+from aruco.model import Camera
 from aruco.pose_math import invert_transform
 from rigcal.__main__ import main
 from rigcal.formats.registry import MODULES, NAMES, cameras_of, detect, format_named, read_rig
@@ -136,7 +137,23 @@ def test_a_recording_of_other_cameras_is_named(truth: Path, demo_folder: Path, t
     other = tmp_path / "other"
     shutil.copytree(demo_folder / min(read_rig(truth).T_world_cam), other / "webcam")
     result = convert(truth, "--to", "opencv", "-o", tmp_path / "rig.yaml", "--recording", other)
-    assert_one_sentence(result, "has camera webcam", min(read_rig(truth).T_world_cam))
+    assert_one_sentence(result, "has camera webcam", min(read_rig(truth).T_world_cam), "give the recording")
+    lens = tmp_path / "left.json"
+    lines = (other / "webcam" / "camera_info.yaml").read_text().splitlines()
+    lens.write_text("\n".join(line for line in lines if not line.startswith("camera_name")))
+    result = convert(truth, "--to", "opencv", "-o", tmp_path / "rig.yaml", "--intrinsics", lens)
+    assert_one_sentence(result, "left.json: has camera left", "rename the file")
+
+
+def test_new_poses_in_a_configuration_are_told_as_such(truth: Path, tmp_path: Path) -> None:
+    fusion, one = tmp_path / "fusion.json", tmp_path / "one.json"
+    assert convert(truth, "--to", "zed-fusion", "-o", fusion).exit_code == 0
+    content = json.loads(fusion.read_text())
+    fusion.write_text(json.dumps(dict([content.popitem()])))
+    result = convert(truth, "--to", "zed-fusion", "--into", fusion, "-o", one)
+    assert result.exit_code == 0, result.output
+    assert "4 cameras" not in result.output  # one was written
+    assert f"Wrote {one}: {fusion} with new poses for its cameras that the calibration has." in result.output
 
 
 def test_inputs_are_never_written_to(truth: Path, demo_folder: Path, tmp_path: Path) -> None:
@@ -166,24 +183,65 @@ def test_what_a_recording_consists_of_is_not_replaced(truth: Path, tmp_path: Pat
     elsewhere.mkdir()
     (elsewhere / "c.avi").write_bytes(b"precious")
     (video / "c.avi").symlink_to(elsewhere / "c.avi")
-    for name in ("b.avi", "a.yaml", "markers.parquet", "new.json.part"):
+    for name in ("b.avi", "a.yaml", "markers.parquet"):
         (video / name).write_bytes(b"precious")
-    for out in (video / "b.avi", video / "c.avi", elsewhere / "c.avi", video / "new.json"):
+    for out in (video / "b.avi", video / "c.avi", elsewhere / "c.avi"):
         for recording in (video, video / "b.avi"):
             result = convert(truth, "--to", "opencv", "-o", out, "--recording", recording)
-            assert_one_sentence(result, "is an input", out.name)
+            assert_one_sentence(result, "lies in a recording that is given, or beside it", out.name)
     for name in ("a.yaml", "markers.parquet"):
         result = convert(truth, "--to", "tum", "-o", video / name, "--recording", video / "b.avi")
-        assert_one_sentence(result, "is an input", name)
+        assert_one_sentence(result, "lies in a recording that is given, or beside it", name)
     assert {path.read_bytes() for path in video.iterdir()} == {b"precious"}
-    assert len(list(video.iterdir())) == 5
+    assert len(list(video.iterdir())) == 4
 
 
-@pytest.mark.parametrize("end", [".part", ".old"])
-def test_names_that_writing_passes_through_are_no_inputs(end: str, truth: Path, tmp_path: Path) -> None:
-    source = truth.rename(tmp_path / f"x.json{end}")
+@pytest.mark.parametrize("name", NAMES)
+def test_an_earlier_output_is_replaced_in_a_recording_too(name: str, truth: Path, demo_folder: Path, tmp_path: Path):
+    recording = shutil.copytree(demo_folder, tmp_path / "rec")
+    out = out_of(name, recording)
+    written = []
+    for _ in range(2):
+        result = convert(truth, "--to", name, "-o", out, "--recording", recording)
+        assert result.exit_code == 0, result.output
+        written.append({path.name: path.read_bytes() for path in ([out] if out.is_file() else out.iterdir())})
+    assert written[0] == written[1]
+
+
+def test_intrinsics_that_a_recording_was_read_with_are_not_replaced(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    from video_writer import moving_images, write_video
+
+    write_video(tmp_path / "left.mp4", moving_images(2))
+    camera = Camera(name="left", width=160, height=120, K=np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]]))
+    rig = Rig(T_world_cam={"left": np.eye(4)}, up="+y", cameras={"left": camera})
+    source, chain = tmp_path / "in.json", tmp_path / "camchain.yaml"
+    format_named("native").write(rig, source, ExportOptions())
+    format_named("kalibr").write(rig, chain, ExportOptions())
+    before = chain.read_bytes()
+    arguments = (source, "--to", "kalibr", "-o", chain, "--recording", tmp_path / "left.mp4")
+    assert_one_sentence(convert(*arguments), "camchain.yaml: is an input, where the recording's intrinsics are")
+    assert chain.read_bytes() == before
+    # Where they are not looked for it is an earlier output like any other.
+    chain = chain.rename(tmp_path / "rig.yaml")
+    result = convert(
+        source, "--to", "kalibr", "-o", chain, "--recording", tmp_path / "left.mp4", "--intrinsics", source
+    )
+    assert result.exit_code == 0, result.output
+
+
+def test_a_calibration_in_another_format_is_not_replaced(truth: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copy(truth, tmp_path / "other.json"))
+    before = other.read_bytes()
+    for arguments in ((truth, other, "--to", "tum"), (truth, "--to", "tum", "-o", other)):
+        assert_one_sentence(convert(*arguments), "other.json: is a calibration in another format (native)", "remove it")
+    assert other.read_bytes() == before
+
+
+def test_the_name_that_writing_passes_through_may_be_an_inputs(truth: Path, tmp_path: Path) -> None:
+    source = truth.rename(tmp_path / "x.json.part")
     before = source.read_bytes()
-    assert_one_sentence(convert(source, "--to", "tum", "-o", tmp_path / "x.json"), "is an input", source.name)
+    assert_one_sentence(convert(source, "--to", "tum", "-o", tmp_path / "x.json"), "is in the way", source.name)
     assert source.read_bytes() == before
     assert not (tmp_path / "x.json").exists()
 
@@ -346,3 +404,16 @@ def test_explaining_a_format_loads_no_optional_package() -> None:
     )
     subprocess.run([sys.executable, "-c", code], check=True)
     assert len(MODULES) == 12
+
+
+def test_a_pattern_of_the_shell_does_not_replace_a_calibration(truth: Path, tmp_path: Path) -> None:
+    """``rigcal convert *.json --to native``, of two files."""
+    other = tmp_path / "other.json"
+    rig = read_rig(truth)
+    format_named("native").write(Rig(T_world_cam={"x": np.eye(4)}), other, ExportOptions())
+    before = other.read_bytes()
+    assert_one_sentence(convert(truth, other, "--to", "native"), "other.json: is a calibration already", "-o")
+    assert other.read_bytes() == before
+    # Given as the output it is one.
+    assert convert(truth, "--to", "native", "-o", other).exit_code == 0
+    assert worst_pose_difference(read_rig(other), rig) == 0

@@ -153,6 +153,17 @@ def test_caliscopes_older_files_are_read(tmp_path: Path) -> None:
     assert rig.cameras["cam_2"].distortion.tolist() == [-0.3, 0.05, -0.004, 0.004, 0.06]
 
 
+def test_cameras_that_are_ignored_are_named(tmp_path: Path, said: list[str]) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(OLD_CALISCOPE)
+    for read in (registry.read_rig, registry.cameras_of):
+        said.clear()
+        read(path)
+        assert [line for line in said if "ignore = true" in line] == [
+            f"{path}: camera cam_4 has ignore = true there and is left out"
+        ]
+
+
 def test_a_rational_lens_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="aniposelib cannot hold the rational_polynomial distortion of camera a"):
         written(format_rig({"a": "rational"}), tmp_path)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from format_rigs import format_rig, lens, pixels, points_before, worst_pose_difference
+from loguru import logger
 
 from aruco.errors import InputError, OutputError
 from aruco.pose_math import invert_transform
@@ -128,6 +129,49 @@ def test_an_earlier_model_is_replaced_and_nothing_else(rig: Rig, folder: Path):
     assert (folder / "database.db").read_bytes() == b"precious"
 
 
+@pytest.mark.parametrize("points", ["1 0.5 0.25 2 128 128 128 0.3 1 0\n", "", None])
+def test_a_reconstruction_of_other_programs_is_not_replaced(points: str | None, rig: Rig, folder: Path, tmp_path: Path):
+    """Not even where it has our rig configuration, and nothing but the files of a model."""
+    (folder / "points3D.txt").unlink()
+    if points is not None:
+        (folder / "points3D.txt").write_text(points)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(OutputError, match=r"holds cameras\.txt, which was not written here"):
+        FORMAT.write(rig, folder, ExportOptions())
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
+def test_an_empty_folder_is_filled(rig: Rig, tmp_path: Path):
+    (tmp_path / "model").mkdir()
+    FORMAT.write(rig, tmp_path / "model", ExportOptions())
+    assert worst_pose_difference(rig, FORMAT.read(tmp_path / "model")) < ROUND_TRIP
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters", "kind", "distortion"),
+    [
+        ("SIMPLE_PINHOLE", "500 320 240", "plumb_bob", [0, 0, 0, 0, 0]),
+        ("RADIAL", "500 320 240 0.1 -0.02", "plumb_bob", [0.1, -0.02, 0, 0, 0]),
+        ("SIMPLE_RADIAL_FISHEYE", "500 320 240 0.1", "equidistant", [0.1, 0, 0, 0]),
+        ("RADIAL_FISHEYE", "500 320 240 0.1 -0.02", "equidistant", [0.1, -0.02, 0, 0]),
+    ],
+)
+def test_lenses_that_only_other_programs_write_mean_what_colmap_means(
+    model: str, parameters: str, kind: str, distortion: list[float], tmp_path: Path
+):
+    (tmp_path / "cameras.txt").write_text(f"1 {model} 640 480 {parameters}\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a/1.png\n\n")
+    rig = FORMAT.read(tmp_path)
+    camera = rig.cameras["a"]
+    assert (camera.distortion_model, camera.distortion.tolist()) == (kind, distortion)
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Camera(model=model, width=640, height=480, params=[float(word) for word in parameters.split()])
+    points = points_before(rig, "a")
+    found = np.array([theirs.img_from_cam(point) for point in points])
+    assert np.abs(found - 0.5 - pixels(rig, "a", points)).max() < PIXEL_TOLERANCE
+
+
 def test_models_of_other_programs_are_read(tmp_path: Path):
     (tmp_path / "cameras.txt").write_text("# x\n7 SIMPLE_RADIAL 640 480 500 320 240 0.1\n")
     (tmp_path / "images.txt").write_text(
@@ -188,3 +232,50 @@ def test_images_that_fall_on_one_name_are_named(tmp_path: Path):
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a/left/1.png\n\n2 1 0 0 0 1 0 0 1 b/left/1.png\n\n")
     with pytest.raises(InputError, match=r"'a/left/1\.png' and 'b/left/1\.png' .*camera left, by the last folder"):
         FORMAT.read(tmp_path)
+
+
+def said_of(folder: Path) -> tuple[Rig | None, list[str]]:
+    """What reading gives, or None, and the warnings."""
+    said: list[str] = []
+    handler = logger.add(said.append, level="WARNING")
+    try:
+        return FORMAT.read(folder), said
+    except InputError as error:
+        return None, [str(error)]
+    finally:
+        logger.remove(handler)
+
+
+@pytest.mark.parametrize("name", ["images.txt", "cameras.txt", "rig_config.json"])
+def test_a_model_that_was_cut_anywhere_is_refused_or_told(name: str, rig: Rig, folder: Path):
+    whole = (folder / name).read_bytes()
+    assert said_of(folder)[1] == []
+    # What another camera's numbers would be cut like; the last line and the end of the one before.
+    for end in range(len(whole) - 330, len(whole)):
+        (folder / name).write_bytes(whole[:end])
+        read, said = said_of(folder)
+        is_harmless = read is not None and worst_pose_difference_or_inf(read, rig) < ROUND_TRIP
+        assert said or (is_harmless and whole[end:].strip(b"]}\n") == b""), end
+
+
+def worst_pose_difference_or_inf(a: Rig, b: Rig) -> float:
+    return worst_pose_difference(a, b) if list(a.T_world_cam) == list(b.T_world_cam) else np.inf
+
+
+def test_cameras_that_no_image_shows_are_named(folder: Path):
+    lines = (folder / "images.txt").read_text().splitlines(keepends=True)
+    (folder / "images.txt").write_text("".join(lines[:-2]))
+    rig, said = said_of(folder)
+    assert rig is not None
+    assert "has no image of camera z_fish, which is in rig_config.json" in said[0]
+    (folder / "rig_config.json").unlink()
+    assert "has no image of camera with id 5, which is in cameras.txt" in said_of(folder)[1][0]
+
+
+def test_an_image_of_no_camera_of_the_rig_is_refused(folder: Path):
+    text = (folder / "images.txt").read_text()
+    (folder / "images.txt").write_text(text.replace("z_fish/image.png", "z_f"))
+    with pytest.raises(
+        InputError, match=r"'z_f' is of no camera in rig_config\.json, which has a, b12, front, left, z"
+    ):
+        FORMAT.read(folder)

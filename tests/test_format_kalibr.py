@@ -11,6 +11,7 @@ import yaml
 from format_rigs import format_rig, lens, pixels, points_before, worst_pose_difference
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loguru import logger
 
 from aruco.errors import InputError
 from aruco.pose_math import exp_se3, invert_transform
@@ -128,6 +129,35 @@ cam1:
     assert not rig.cameras["cam1"].has_distortion
 
 
+LENS = """camera_model: pinhole, distortion_coeffs: [-0.28, 0.07, 0.0, 1.0e-05], distortion_model: radtan,
+  intrinsics: [458.6, 457.2, 367.2, 248.3], resolution: [752, 480], rostopic: /left/image_raw"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"%YAML:1.0 # of OpenVINS\n\ncam0: {{{LENS}}}\n",
+        f"%YAML 1.2\n---\ncam0: {{{LENS}}}\n",
+        f"cam0: # the left one\n  {{{LENS}}}\n",
+        f"\ufeffcam0: {{{LENS}}}\n",
+        f"cam0 :\r\n  {{{LENS}}}\r\n",
+    ],
+)
+def test_files_of_other_programs_in_kalibrs_layout_are_known(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "kalibr_imucam_chain.yaml"
+    path.write_bytes(text.encode())
+    assert registry.detect(path).name == "kalibr"
+    cameras = registry.cameras_of(path)
+    assert cameras["left"].K[0, 0] == 458.6
+
+
+def test_lines_are_counted_from_the_top_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "chain.yaml"
+    path.write_text(f"%YAML:1.0\ncam0: {{{LENS}}}\ncam0: {{{LENS}}}\n")
+    with pytest.raises(InputError, match="line 4: 'cam0' is there twice"):
+        registry.read_rig(path)
+
+
 @pytest.mark.parametrize("kind", ["brown_k3", "rational"])
 def test_a_lens_that_kalibr_cannot_hold_is_refused(kind: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"kalibr cannot hold the .* distortion of camera a"):
@@ -190,3 +220,46 @@ def test_gaps_and_references_without_end_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         registry.read_rig(path)
     assert len(str(caught.value)) < 500
+
+
+def said_of(path: Path) -> tuple[Rig | None, list[str]]:
+    """What reading gives, or None, and the warnings."""
+    said: list[str] = []
+    handler = logger.add(said.append, level="WARNING")
+    try:
+        return registry.read_rig(path), said
+    except InputError as error:
+        return None, [str(error)]
+    finally:
+        logger.remove(handler)
+
+
+def test_a_chain_that_was_cut_anywhere_is_refused_or_told(tmp_path: Path) -> None:
+    path = written(format_rig(KINDS), tmp_path)
+    whole = path.read_bytes()
+    assert said_of(path)[1] == []
+    for end in range(whole.index(b"cam2"), len(whole)):
+        path.write_bytes(whole[:end])
+        rig, said = said_of(path)
+        # A camera that is gone to its last letter cannot be missed: Kalibr states no number of cameras.
+        assert said or (rig is not None and len(rig.T_world_cam) == 2 and path.read_bytes().endswith(b"image_raw\n"))
+
+
+def test_topics_that_are_whole_still_name_their_cameras(tmp_path: Path) -> None:
+    path = written(format_rig(KINDS), tmp_path)
+    path.write_text(path.read_text().replace("/zwölf/image_raw", "/zw"))
+    rig, said = said_of(path)
+    assert rig is not None
+    assert list(rig.T_world_cam) == ["34563472", "cam2", "front left"]
+    assert "cam2 keeps the name that Kalibr gave" in said[0]
+
+
+@pytest.mark.parametrize("topic", ["/front left/image_raw", "/cam0/image_raw"])
+def test_topics_that_name_two_cameras_alike_name_none(topic: str, tmp_path: Path) -> None:
+    path = written(format_rig(KINDS), tmp_path)
+    text = path.read_text().replace("/34563472/image_raw", "/34563472")
+    path.write_text(text.replace("/zwölf/image_raw", topic))
+    rig, said = said_of(path)
+    assert rig is not None
+    assert list(rig.T_world_cam) == ["cam0", "cam1", "cam2"]
+    assert "do not tell its cameras apart" in said[0]

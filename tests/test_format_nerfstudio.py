@@ -108,7 +108,7 @@ def test_the_usual_mistakes_would_be_seen(wrong: str, tmp_path: Path):
 
 
 def test_an_unknown_up_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="--auto-align"):
+    with pytest.raises(InputError, match="which way is up"):
         written(format_rig(BENT, None), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -163,6 +163,49 @@ def test_a_world_that_somebody_turned_is_given_back_as_it_was_and_its_up_is_unkn
 
 
 @pytest.mark.parametrize(
+    ("changes", "kind", "distortion"),
+    [
+        ({"is_fisheye": False}, "plumb_bob", [0.1, 0.02, 0, 0, 0]),
+        ({"is_fisheye": True}, "equidistant", [0.1, 0.02, 0, 0]),  # as instant-ngp's scripts write it
+        ({"is_fisheye": True, "camera_model": "OPENCV_FISHEYE"}, "equidistant", [0.1, 0.02, 0, 0]),
+        ({"is_fisheye": False, "camera_model": "OPENCV_FISHEYE"}, "equidistant", [0.1, 0.02, 0, 0]),
+        ({"camera_model": "RADIAL"}, "plumb_bob", [0.1, 0.02, 0, 0, 0]),
+        ({"camera_model": "RADIAL_FISHEYE"}, "equidistant", [0.1, 0.02, 0, 0]),
+        ({"camera_model": "SIMPLE_RADIAL_FISHEYE", "k2": 0}, "equidistant", [0.1, 0, 0, 0]),
+    ],
+)
+def test_which_lens_a_file_means(changes: dict[str, Any], kind: str, distortion: list[float], tmp_path: Path):
+    content = {key: value for key, value in FOREIGN.items() if key != "camera_model"}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({**content, "k2": 0.02, **changes}))
+    camera = FORMAT.read(path).cameras["frame_01"]
+    assert (camera.distortion_model, camera.distortion.tolist()) == (kind, distortion)
+
+
+def test_what_the_files_root_says_goes_before_what_a_frame_says(tmp_path: Path):
+    """As in nerfstudio's loader: a key is looked for in the root first."""
+    frame = {**FOREIGN["frames"][0], "fl_x": 1, "cx": 2, "k2": 0.03}
+    camera = FORMAT.read(foreign(tmp_path, frames=[frame])).cameras["frame_01"]
+    assert camera.K.tolist() == [[500, 0, 319.5], [0, 501, 239.5], [0, 0, 1]]
+    assert camera.distortion.tolist() == [0.1, 0.03, 0, 0, 0]  # and what it does not say is the frame's
+
+
+@pytest.mark.parametrize(
+    ("image", "name"),
+    [
+        ("./train/r_0", "train-r_0"),  # Blender's sets have no suffixes
+        ("r_0", "r_0"),
+        ("images/left.0/1.png", "left.0-1"),
+        ("images/left.0/r_1", "left.0-r_1"),
+        ("./images/a.b.png", "a.b"),
+    ],
+)
+def test_cameras_are_called_like_their_images(image: str, name: str, tmp_path: Path):
+    rig = FORMAT.read(foreign(tmp_path, frames=[{**FOREIGN["frames"][0], "file_path": image}]))
+    assert list(rig.T_world_cam) == [name]
+
+
+@pytest.mark.parametrize(
     ("changes", "told"),
     [
         ({"frames": []}, "no frames"),
@@ -176,6 +219,12 @@ def test_a_world_that_somebody_turned_is_given_back_as_it_was_and_its_up_is_unkn
         ({"w": -640}, "whole number"),
         ({"cx": None}, "cx must be"),
         ({"applied_scale": 0}, "positive"),
+        ({"applied_scale": 1e-300}, "applied_scale of 1e-300"),
+        ({"applied_scale": 1e-30, "frames": [{**FOREIGN["frames"][0], "transform_matrix":
+          [[1, 0, 0, 10], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}]}, "frame 0: its place"),
+        ({"is_fisheye": True}, "is_fisheye is true, and camera_model OPENCV"),
+        ({"is_fisheye": "yes"}, "true or false"),
+        ({"frames": [{**FOREIGN["frames"][0], "file_path": ""}]}, "cannot be called"),
     ],
 )  # fmt: skip
 def test_a_damaged_file_is_refused_in_one_sentence(changes: dict[str, Any], told: str, tmp_path: Path):

@@ -10,7 +10,6 @@ import numpy as np
 import open3d as o3d
 import pytest
 from format_rigs import format_rig, pixels, points_before, worst_pose_difference
-from loguru import logger
 
 from aruco.errors import InputError
 from rigcal.formats import registry
@@ -90,13 +89,35 @@ def test_open3ds_own_files_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(one.T_world_cam["cam0"], own.T_world_cam["cam1"], atol=0)
 
 
-def test_distortion_is_not_dropped_silently(tmp_path: Path) -> None:
-    said: list[str] = []
-    logger.add(said.append, level="WARNING")
-    written(format_rig({"a": "pinhole", "b": "brown", "c": "fisheye"}), tmp_path)
+def test_distortion_is_not_dropped_silently(tmp_path: Path, said: list[str]) -> None:
+    rig = format_rig({"a": "pinhole", "b": "brown", "c": "fisheye", "d": "rational"})
+    path = written(rig, tmp_path)
     assert len(said) == 1
-    assert "camera b, c" in said[0]
+    assert "camera b, c, d" in said[0]
     assert "undistorted" in said[0]
+    for cameras in (registry.cameras_of(path), registry.read_rig(path).cameras):
+        for name, camera in rig.cameras.items():
+            assert cameras[name].distortion_model == camera.distortion_model
+            assert cameras[name].distortion.tolist() == camera.distortion.tolist()
+    assert len(said) == 1  # what is known is not doubted
+
+
+def test_a_file_that_does_not_know_the_distortion_says_so(tmp_path: Path, said: list[str]) -> None:
+    trajectory = o3d.io.read_pinhole_camera_trajectory(str(written(format_rig(KINDS), tmp_path)))
+    own = tmp_path / "own.json"
+    o3d.io.write_pinhole_camera_trajectory(str(own), trajectory)  # of ours, Open3D keeps what it knows
+    for read in (registry.cameras_of, registry.read_rig):
+        said.clear()
+        read(own)
+        (doubt,) = [line for line in said if "distortion" in line]
+        assert doubt.startswith(
+            f"{own}: Open3D's format has no place for lens distortion, so camera cam0, cam1, cam2 is"
+        )
+    content = json.loads(written(format_rig({"a": "brown"}), tmp_path).read_text())
+    content["parameters"][0]["distortion_model"] = "fov"
+    own.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"camera a: .*fov"):
+        registry.cameras_of(own)
 
 
 @pytest.mark.parametrize(

@@ -144,8 +144,8 @@ def test_a_pose_that_was_changed_in_one_place_only_is_refused(tmp_path: Path) ->
     [
         ("rows: 4", "rows: 999999999", "T_world_cam must be 4 x 4"),
         ("rows: 3", "rows: -3", "whole number"),
-        ("name: b", "name: a", "a name of its own"),
-        ("name: b", 'name: "a/../b"', "cannot be called 'a/../b'"),
+        ('name: "b"', "name: a", "a name of its own"),
+        ('name: "b"', 'name: "a/../b"', "cannot be called 'a/../b'"),
         ("image_width: 1280", "image_width: 1e9", "whole number"),
         ("cameras:", "cameras: 5\nrest:", "sequence of maps"),
         ("cameras:", "cameras: [", "not readable as YAML"),
@@ -181,8 +181,44 @@ def test_skew_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["a'b", " a", "a ", '"a"', '"'])
-def test_names_that_cv2_misspells_are_refused(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="opencv cannot hold the name"):
-        FORMAT.write(Rig(T_world_cam={name: np.eye(4)}), tmp_path / "rig.yaml", ExportOptions())
-    assert not (tmp_path / "rig.yaml").exists()
+# What cv2, left alone, writes so that it is read as something else, by OpenCV 4, OpenCV 5 or YAML.
+ODD_NAMES = ["a'b", " a", "a ", '"a"', '"', "'", 'a"', 'zw"ölf', "true", "null", "~", "1e5", "- a", "a: b", "#x", "[a]"]
+
+
+def test_odd_names_are_read_by_opencv_and_by_yaml(tmp_path: Path) -> None:
+    rig = Rig(T_world_cam={name: np.eye(4) for name in ODD_NAMES})
+    path = written(rig, tmp_path)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    nodes = storage.getNode("cameras")
+    assert [nodes.at(index).getNode("name").string() for index in range(nodes.size())] == sorted(ODD_NAMES)
+    assert list(registry.read_rig(path).T_world_cam) == sorted(ODD_NAMES)
+
+
+def test_a_name_that_fits_in_no_line_of_cv2_is_refused(tmp_path: Path) -> None:
+    for name in ("x" * 5000, '"' * 2100, "\u00e4" * 2100):
+        with pytest.raises(InputError, match="opencv cannot hold the name"):
+            written(Rig(T_world_cam={name: np.eye(4)}), tmp_path)
+        assert not list(tmp_path.iterdir())
+    longest = "x" * 3990
+    assert list(registry.read_rig(written(Rig(T_world_cam={longest: np.eye(4)}), tmp_path)).T_world_cam) == [longest]
+    storage = cv2.FileStorage(str(tmp_path / "rig.yaml"), cv2.FILE_STORAGE_READ)
+    assert storage.getNode("cameras").at(0).getNode("name").string() == longest
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
+@pytest.mark.parametrize(("key", "value"), [(None, 0), ("fisheye_model", 0), ("distortion_model", "plumb_bob")])
+def test_four_coefficients_that_may_be_a_fisheyes_are_doubted(
+    key: str | None, value: int | str, suffix: str, tmp_path: Path, said: list[str]
+) -> None:
+    path = tmp_path / f"cam.{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    if key:
+        storage.write(key, value)
+    storage.write("camera_matrix", np.diag([500.0, 500, 1]))
+    storage.write("distortion_coefficients", np.array([[-0.01], [0.003], [-0.002], [0.0004]]))  # as cv2.fisheye has it
+    storage.release()
+    assert registry.cameras_of(path)["cam"].distortion_model == "plumb_bob"
+    assert len(said) == (key is None)
+    assert all(word in line for line in said for word in (str(path), "k1, k2, p1, p2", "fisheye_model: 1"))

@@ -181,6 +181,75 @@ def test_frames_without_an_optical_name_are_read_with_a_warning(tmp_path: Path, 
     assert "tip" in said[0]
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        # Of two quaternions and of Euler angles, ROS 1's tf with its period, its tf2_ros without.
+        (("tf", "0 0 1.2 0 0 -1.5707963267948966 world a_optical_frame 100"), level_camera(1.2)),
+        (("tf", "0 0 1.2 -0.70710678118 0 0 0.70710678118 /world /a_optical_frame 100"), level_camera(1.2)),
+        (("tf2_ros", "0 0 1.2 0 0 -1.5707963267948966 world a_optical_frame"), level_camera(1.2)),
+        (("tf2_ros", "0 0 1.2 -0.70710678118 0 0 0.70710678118 world a_optical_frame"), level_camera(1.2)),
+    ],
+)
+def test_launch_files_of_ros_1_are_read(tmp_path: Path, arguments: tuple[str, str], expected: Any):
+    package, words = arguments
+    path = tmp_path / "given.launch"
+    path.write_text(f'<launch><node pkg="{package}" type="static_transform_publisher" args="{words}"/></launch>')
+    rig = FORMAT.read(path)
+    assert np.abs(rig.T_world_cam["a"] - expected).max() < 1e-10  # eleven digits of a quaternion
+
+
+@pytest.mark.parametrize("more", [["--ros-args", "--log-level", "warn"], ["--ros-args", "-p", "a:=1", "--"]])
+def test_what_is_meant_for_ros_itself_is_left_to_it(tmp_path: Path, more: list[str]):
+    ends = ["--frame-id", "world", "--child-frame-id", "a_optical_frame"]
+    for arguments in ([*ends, *more], [*more, *ends] if more[-1] == "--" else [*ends, *more]):
+        assert list(FORMAT.read(launch_of(tmp_path, arguments)).T_world_cam) == ["a"]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        "['--x', LaunchConfiguration('x'), '--frame-id', 'world', '--child-frame-id', 'robot']",
+        "[x, y, z, '0', '0', '0', 'world', 'robot']",
+        "['--frame-id', 'world', '--child-frame-id', name]",
+        "compute()",
+        "['0', '0', *rest, 'world', 'robot']",
+    ],
+)
+def test_a_computed_publisher_of_something_else_does_not_matter(tmp_path: Path, other: str, said: list[str]):
+    node = f'Node(package="tf2_ros", executable="static_transform_publisher", arguments={other}), '
+    path = launch_of(tmp_path, ["--frame-id", "world", "--child-frame-id", "a_optical_frame"], node)
+    assert list(FORMAT.read(path).T_world_cam) == ["a"]
+    assert all("computed" in line and "line 6" in line for line in said)
+    assert bool(said) == ("robot" not in other or "*" in other)  # told where nobody knows whose it is
+
+
+def test_a_camera_on_a_computed_frame_is_refused(tmp_path: Path):
+    path = tmp_path / "rig.launch.xml"
+    node = '<node pkg="tf2_ros" exec="static_transform_publisher" args="--x {} --frame-id {} --child-frame-id {}"/>'
+    nodes = node.format("$(var x 5)", "world", "mast") + node.format("1", "mast", "a_optical_frame")
+    path.write_text(f"<launch>{nodes}</launch>")
+    with pytest.raises(
+        InputError, match="frame a_optical_frame hangs on mast, which is placed by numbers that are comp"
+    ):
+        FORMAT.read(path)
+
+
+def test_cameras_that_hang_from_another_one_know_no_up(tmp_path: Path, said: list[str]):
+    between = ["--x", "0.5", "--frame-id", "left_optical_frame", "--child-frame-id", "right_optical_frame"]
+    rig = FORMAT.read(launch_of(tmp_path, between))
+    assert rig.up is None
+    assert rig.T_world_cam["left"].tolist() == np.eye(4).tolist()
+    assert rig.T_world_cam["right"][:3, 3].tolist() == [0.5, 0.0, 0.0]  # the child's place in its parent
+    assert "up stays unknown" in said[0]
+
+
+@pytest.mark.parametrize("name", ["zed_x", "zed_x_mini", "a_x", "_", "x_1", "cam_xg_"])
+def test_ordinary_names_stay_as_they_are(name: str):
+    assert frame_of(name, DEFAULT.frame_name) == f"{name}_left_camera_optical_frame"
+    assert frame_of("zed_x2d_", "{camera}") == "zed_x5f_x2d_"  # not zed-
+
+
 def test_other_nodes_and_the_style_of_the_file_do_not_matter(tmp_path: Path):
     path = launch_of(tmp_path, ["--frame-id", "world", "--child-frame-id", "a_optical_frame"], r"Node(x='\d'), f(), ")
     with warnings.catch_warnings():
@@ -239,6 +308,11 @@ ENDS = ["--frame-id", "world", "--child-frame-id", "a_optical_frame"]
     [
         ("[str(x)]", "computed"),
         ("compute()", "computed"),
+        ("['--x', '1', *FRAMES]", "computed"),
+        (
+            "['--x', str(1.0), '--frame-id', 'world', '--child-frame-id', 'a_optical_frame']",
+            "frame a_optical_frame is p",
+        ),
         ([], "lacks --frame-id"),
         (ENDS[:2], "lacks --frame-id or --child-frame-id"),
         ([*ENDS, "--x"], "'--x' is not understood"),
@@ -277,7 +351,10 @@ def test_frames_in_two_worlds_or_twice_are_refused(tmp_path: Path):
         ('<!DOCTYPE x [<!ENTITY a "b">]><launch/>', "DOCTYPE"),
         ("<launch/>", "holds no frame of a camera"),
         ('<launch><node exec="static_transform_publisher" args="&quot;"/></launch>', "cannot be parted"),
-        ('<launch><node exec="static_transform_publisher" args="--x $(var x)"/></launch>', "is not understood"),
+        ('<launch><node exec="static_transform_publisher" args="--x $(var x)"/></launch>', "lacks --frame-id"),
+        ('<launch><node exec="static_transform_publisher" args="--x $(x $(y z)) $(a"/></launch>', "are computed"),
+        ('<launch><node exec="static_transform_publisher" args="--x $(a"/></launch>', "lacks --frame-id"),
+        ('<launch><node exec="static_transform_publisher" args="$(var all of it)"/></launch>', "computed"),
         ("#" * (5 * 2**20), "over 1024 KiB"),
     ],
 )
@@ -296,3 +373,15 @@ def test_it_is_recognised_by_its_content(tmp_path: Path, name: str):
     assert FORMAT.recognises(tmp_path / name, (tmp_path / name).read_bytes()[: 2**16])
     for head in (b"", b"<launch></launch>", b"static_transform_publisher", b"<robot/>", b"\xff\xfe\x00"):
         assert not FORMAT.recognises(tmp_path / name, head)
+
+
+@pytest.mark.parametrize("name", ["a" * 230, "\u00fc" * 46, "camera"])
+def test_names_that_would_not_be_read_are_not_written(tmp_path: Path, name: str):
+    out = tmp_path / "r.launch.py"
+    FORMAT.write(random_rig(1, names=(name[:-1],)), out, DEFAULT)
+    assert list(FORMAT.read(out).T_world_cam) == [name[:-1]]
+    out.unlink()
+    options = ExportOptions(frame_name="x" * 248 + "{camera}") if name == "camera" else DEFAULT
+    with pytest.raises(InputError, match=r"255 (signs )?at most"):
+        FORMAT.write(random_rig(1, names=(name,)), out, options)
+    assert not out.exists()

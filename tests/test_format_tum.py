@@ -91,3 +91,66 @@ def test_a_long_trajectory_is_no_rig(tmp_path: Path) -> None:
     path.write_text("0 0 0 0 0 0 0 1\n" * 70_000)
     with pytest.raises(InputError, match="over 1024 KiB"):
         FORMAT.read(path)
+
+
+def said_of(path: Path) -> tuple[Rig | None, list[str]]:
+    """What reading gives, or None, and the warnings."""
+    said: list[str] = []
+    handler = logger.add(said.append, level="WARNING")
+    try:
+        return FORMAT.read(path), said
+    except InputError as error:
+        return None, [str(error)]
+    finally:
+        logger.remove(handler)
+
+
+def test_a_file_that_was_cut_anywhere_is_refused_or_told(tmp_path: Path) -> None:
+    rig = format_rig(KINDS)
+    path = written(rig, tmp_path)
+    whole = path.read_bytes()
+    for end in range(len(whole)):
+        path.write_bytes(whole[:end])
+        assert said_of(path)[1], end
+    path.write_bytes(whole)
+    assert said_of(path)[1] == []
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "is_whole"),
+    [
+        # 3 -5 4 7 in four decimals: whole, and with the last number cut.
+        ("0.3015 -0.5025 0.4020 0.7035", True),
+        ("0.3015 -0.5025 0.4020 0.70", False),
+        ("0.3015 -0.5025 0.4020 0.703", False),
+        ("0.71 0.71 0 0", True),
+        ("0.707107 0.0 0.0 0.707107", True),
+        ("7.07107e-01 0.0 0.0 7.07107e-01", True),
+        ("0.7071067811865476 0.0 0.0 0.707", True),
+        ("0.7071067811865476 0.0 0.0 0.70", False),
+    ],
+)
+def test_a_quaternion_is_as_long_as_its_digits_allow(quaternion: str, is_whole: bool, tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(f"0 1 2 3 0 0 0 1\n1 1 2 3 {quaternion}\n")
+    rig, said = said_of(path)
+    assert (rig is not None) == is_whole
+    assert is_whole or "line 2: the quaternion's length is 0." in said[0]
+
+
+@pytest.mark.parametrize("digits", [3, 4, 6, 9])
+def test_rounding_and_cutting_digits_is_never_taken_for_damage(digits: int, tmp_path: Path) -> None:
+    q = np.random.default_rng(3).normal(size=(300, 4))
+    q /= np.linalg.norm(q, axis=1)[:, None]
+    for values in (q, np.trunc(q * 10.0**digits) / 10.0**digits):
+        lines = [f"{n} 0 0 0 {' '.join(f'{x:.{digits}f}' for x in row)}\n" for n, row in enumerate(values)]
+        (tmp_path / "poses.txt").write_text("".join(lines))
+        assert len(FORMAT.read(tmp_path / "poses.txt").T_world_cam) == 300
+
+
+def test_a_last_line_without_an_end_is_told_where_others_wrote_it(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0.5 0.5 0.5 0.5")
+    rig, said = said_of(path)
+    assert rig is not None
+    assert "ends without the end of a line" in said[0]

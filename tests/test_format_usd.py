@@ -223,6 +223,40 @@ def test_stages_of_other_programs_are_read_as_usd_reads_them(tmp_path: Path):
     assert np.allclose(rig.T_world_cam["cam"][:3, 3], [x, z, -y], rtol=0, atol=1e-15)
 
 
+@pytest.mark.parametrize("off", ["active = false", "active = 0"])
+def test_what_is_switched_off_is_not_there(off: str, tmp_path: Path):
+    path = tmp_path / "x.usda"
+    path.write_text(
+        f'#usda 1.0\ndef Camera "a" ( active = true ) {{}}\ndef Camera "b" ( {off} ) {{}}\n'
+        f'def Xform "x" ( {off} ) {{\n def Camera "c" {{}}\n}}\n'
+    )
+    assert list(FORMAT.read(path).T_world_cam) == ["a"]
+    stage = pytest.importorskip("pxr.Usd").Stage.Open(str(path))
+    assert [prim.GetName() for prim in stage.Traverse()] == ["a"]
+
+
+@pytest.mark.parametrize("tail", [".timeSamples = { 0: 0.3 }", ".connect = </x.y>"])
+def test_a_lens_that_changes_with_time_is_not_taken_for_usds_fallback(tail: str, tmp_path: Path):
+    path = written(format_rig({"a": "pinhole"}), tmp_path)
+    text = path.read_text()
+    for key in ("focalLength", "verticalApertureOffset"):
+        for line in (rf"float {key}{tail}", rf"\g<0>\n        float {key}{tail}"):  # alone, or beside the default value
+            path.write_text(re.sub(rf"float {key} = \S+", line, text))
+            with pytest.raises(InputError, match=rf"camera_a: its lens is given by {key}\.") as caught:
+                FORMAT.read(path)
+            assert "bake it" in str(caught.value)
+
+
+def test_a_place_that_changes_with_time_is_not_taken_for_its_default(tmp_path: Path):
+    path = written(format_rig({"a": "pinhole"}), tmp_path)
+    samples = "        matrix4d xformOp:transform.timeSamples = { 0: ( (1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,3,1) ) }\n"
+    text = path.read_text()
+    at = text.index("        uniform token[] xformOpOrder")
+    path.write_text(text[:at] + samples + text[at:])
+    with pytest.raises(InputError, match="without time samples; bake it"):
+        FORMAT.read(path)
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [

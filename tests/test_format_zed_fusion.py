@@ -225,6 +225,18 @@ def test_the_old_layouts_gravity_is_told(tmp_path: Path, warnings_said: list[str
     assert "override_gravity" in warnings_said[0]
 
 
+@pytest.mark.parametrize("more", [{"_comment": "of the hall"}, {"version": "5.1"}, {"settings": {"fps": 30}, "": None}])
+def test_remarks_beside_the_cameras_are_left_alone(tmp_path: Path, more: dict[str, Any], warnings_said: list[str]):
+    path = written(tmp_path, {**more, **entry()})
+    assert list(FORMAT.read(path).T_world_cam) == ["19321109"]
+    rig = random_rig(2, names=("19321109",))
+    FORMAT.write(rig, tmp_path / "f.json", ExportOptions(into=path))
+    filled = json.loads((tmp_path / "f.json").read_text())
+    assert {key: filled[key] for key in more} == more
+    assert farthest(FORMAT.read(tmp_path / "f.json").T_world_cam, rig.T_world_cam) == 0.0
+    assert not [line for line in warnings_said if "is not in the calibration" in line]
+
+
 # --- into a file that is there
 
 
@@ -351,6 +363,8 @@ TOO_DEEP = '{"1": ' + "[" * 100_000 + "]" * 100_000 + "}"
         ('{"1": {', "not readable as JSON"),
         (TOO_DEEP, "not readable as JSON"),
         ({}, "holds no camera"),
+        ({"version": "5.1"}, "holds no camera"),
+        ("{" + " " * 5 * 2**20 + "}", "over 4096 KiB"),
         ('{"1": {"world": {}}, "1": {"world": {}}}', "camera 1 is there twice"),
         ({"left": {"FusionConfiguration": {"pose": REAL_POSE}}}, "'left' is not a camera"),
         ({"../x": {"FusionConfiguration": {"pose": REAL_POSE}}}, "is not a camera"),

@@ -23,7 +23,8 @@ def random_rig(seed: int, *, names: tuple[str, ...] = SERIALS, up: UpAxis | None
     """Cameras that stand anywhere and look anywhere."""
     rng = np.random.default_rng(seed)
     turns = Rotation.from_quat(rng.normal(size=(len(names), 4))).as_matrix()
-    return Rig(T_world_cam={name: make_pose(R, rng.normal(scale=3.0, size=3)) for name, R in zip(names, turns)}, up=up)
+    poses = {name: make_pose(R, rng.normal(scale=3.0, size=3)) for name, R in zip(names, turns)}
+    return Rig(T_world_cam=poses, up=up, origin="target")
 
 
 def level_camera(height_m: float) -> Pose:

@@ -149,9 +149,14 @@ def _tables(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]
     """Camera's name -> table, of those that have a lens."""
     nested = content.get("cameras")
     given = {f"cam_{key}": value for key, value in nested.items()} if isinstance(nested, dict) else content
+    lenses = {
+        k: table for k, table in given.items() if isinstance(table, dict) and isinstance(table.get("matrix"), list)
+    }
+    if ignored := [word(table.get("name")) or key for key, table in lenses.items() if table.get("ignore") is True]:
+        logger.warning("{}: camera {} has ignore = true there and is left out", path, listed(ignored))
     tables: dict[str, dict[str, Any]] = {}
-    for key, table in given.items():
-        if isinstance(table, dict) and isinstance(table.get("matrix"), list) and table.get("ignore") is not True:
+    for key, table in lenses.items():
+        if table.get("ignore") is not True:
             name = word(table.get("name")) or key
             if name in tables:
                 raise InputError(f"{path}: two cameras are called {name[:80]!r}; rename one of them.")

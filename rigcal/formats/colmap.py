@@ -10,19 +10,21 @@ finds a camera's images by their folder, so images are called ``<camera>/...``.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from loguru import logger
 
 from aruco.errors import InputError
 from aruco.model import Camera
 from aruco.pose_math import Pose, invert_transform, make_pose, pose_distance
+from rigcal.formats import native
 from rigcal.formats.colmap_lens import camera_of_model, colmap_model
 from rigcal.formats.image_names import image_name
-from rigcal.formats.reading import number, read_text, whole
-from rigcal.formats.rig import CAMERA_WORD, ExportOptions, Format, Rig, check_name, filled
+from rigcal.formats.reading import number, read_text, warn_of_cut, whole
+from rigcal.formats.rig import CAMERA_WORD, ExportOptions, Format, Rig, check_name, filled, listed
 from rigcal.formats.rotations import rotation_of_xyzw, words, xyzw_of_rotation
 from rigcal.formats.whole_folder import write_folder
 
@@ -55,7 +57,7 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
         POINTS: "# no points: cameras only\n",
         RIG: json.dumps(rigs, indent=2, allow_nan=False) + "\n",
     }
-    write_folder(out, files)
+    write_folder(out, files, mark=POINTS)  # a reconstruction has points
 
 
 def _prefix(pattern: str) -> str:
@@ -105,6 +107,7 @@ def read(path: Path) -> Rig:
     poses: dict[str, Pose] = {}
     cameras: dict[str, Camera] = {}
     first: dict[str, str] = {}
+    used: set[int] = set()
     for where, image, camera_id, T_cam_world in _image_lines(path / IMAGES):
         name, T_world_cam = _camera_name(image, prefixes, where), invert_transform(T_cam_world)
         if name in poses and not _same(poses[name], T_world_cam):
@@ -117,11 +120,29 @@ def read(path: Path) -> Rig:
             raise InputError(f"{where}: camera {camera_id} is not in {CAMERAS}.")
         line, width, height, model, parameters = lenses[camera_id]
         poses[name] = T_world_cam
+        used.add(camera_id)
         first.setdefault(name, image)
         cameras[name] = camera_of_model(name, model, width, height, parameters, line)
     if not poses:
         raise InputError(f"{path / IMAGES}: holds no image; give {WHAT}.")
+    _say_missing(path, {_last(prefix) for prefix in prefixes} - poses.keys(), lenses.keys() - used)
     return Rig(T_world_cam=poses, cameras=cameras)
+
+
+def _say_missing(path: Path, names: Iterable[str], ids: Iterable[int]) -> None:
+    """Say which cameras of the other files have no image, by name where the rig configuration knows it."""
+    if missing := listed(names):
+        where = RIG
+    elif missing := listed(f"with id {camera_id}" for camera_id in ids):
+        where = CAMERAS
+    else:
+        return
+    logger.warning(
+        "{}: has no image of camera {}, which is in {} and left out; if the file was cut short, copy it again",
+        path / IMAGES,
+        missing,
+        where,
+    )
 
 
 def _same(T_a: Pose, T_b: Pose) -> bool:
@@ -134,7 +155,7 @@ _Lens = tuple[str, int, int, str, list[float]]
 
 def _lens_lines(path: Path) -> Iterator[tuple[int, _Lens]]:
     """Camera id -> where it stands, width, height, model, parameters."""
-    for n, line in enumerate(read_text(path, WHAT).splitlines(), start=1):
+    for n, line in enumerate(_lines(path), start=1):
         words, where = line.split(), f"{path}, line {n}"
         if not words or words[0].startswith("#"):
             continue
@@ -146,7 +167,7 @@ def _lens_lines(path: Path) -> Iterator[tuple[int, _Lens]]:
 
 def _image_lines(path: Path) -> Iterator[tuple[str, str, int, Pose]]:
     """Where it stands, image name, camera id, T_cam_world; an image's second line lists points and is passed over."""
-    lines = iter(enumerate(read_text(path, WHAT).splitlines(), start=1))
+    lines = iter(enumerate(_lines(path), start=1))
     for n, line in lines:
         words, where = line.split(maxsplit=9), f"{path}, line {n}"
         if not words or words[0].startswith("#"):
@@ -163,24 +184,39 @@ def _image_lines(path: Path) -> Iterator[tuple[str, str, int, Pose]]:
         next(lines, None)
 
 
+def _lines(path: Path) -> list[str]:
+    text = read_text(path, WHAT)
+    warn_of_cut(text, path)
+    return text.splitlines()
+
+
 def _prefixes(path: Path) -> list[str]:
     """The folders that the rig configuration knows cameras by, longest first; none where there is no such file."""
     if not path.is_file():
         return []
     try:
-        content = json.loads(read_text(path, "COLMAP's rig configuration"))
+        content = json.loads(read_text(path, "COLMAP's rig configuration", native.MAX_FILE_BYTES))
         found = [str(camera["image_prefix"]) for rig in content for camera in rig["cameras"]]
     except (ValueError, RecursionError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not COLMAP's rig configuration ({error!r}); mend or remove it.") from error
-    return sorted(found, key=len, reverse=True)
+    return sorted((prefix for prefix in found if prefix.strip("/")), key=len, reverse=True)
 
 
 def _camera_name(image: str, prefixes: list[str], where: str) -> str:
     """The camera that took an image: by its folder; by the image's own name where it has none."""
-    folder = next((p for p in prefixes if p.strip("/") and image.startswith(p)), image.rpartition("/")[0])
-    name = folder.strip("/").rpartition("/")[2] or Path(image).stem
+    folder = next((prefix for prefix in prefixes if image.startswith(prefix)), None)
+    if folder is None and prefixes:
+        raise InputError(
+            f"{where}: image {image[:80]!r} is of no camera in {RIG}, which has {listed(map(_last, prefixes))}; copy "
+            f"the folder again if {IMAGES} was cut short, else mend or remove {RIG}."
+        )
+    name = _last(image.rpartition("/")[0] if folder is None else folder) or Path(image).stem
     check_name(name, where)
     return name
+
+
+def _last(folder: str) -> str:
+    return folder.strip("/").rpartition("/")[2]
 
 
 def recognises(path: Path, head: bytes) -> bool:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from loguru import logger
 
 from aruco.atomic import write_whole
 from aruco.errors import InputError
@@ -26,6 +27,7 @@ from rigcal.formats.rig import (
     ExportOptions,
     Format,
     Rig,
+    listed,
     numbered_name,
     pinhole_of,
     refuse_distortion,
@@ -35,7 +37,7 @@ from rigcal.formats.rotations import rigid_pose, steady
 WHAT = "a camchain.yaml of Kalibr"
 _CAMERA_KEY = re.compile("cam([0-9]{1,4})")
 _TOPIC = re.compile(r"/([^/_][^/]*)/image_raw")
-_RECOGNISED = re.compile(rb"^cam[0-9]+:\s*$", re.MULTILINE)
+_RECOGNISED = re.compile(rb"^cam[0-9]+\s*:", re.MULTILINE)
 _MODELS: Mapping[str, tuple[DistortionModel, int]] = {
     "radtan": ("plumb_bob", 4),
     "equi": ("equidistant", 4),
@@ -89,23 +91,25 @@ def read(path: Path) -> Rig:
         InputError: The file cannot be read or is no chain; the message names file and key.
     """
     entries = _entries(path)
-    names = _names(entries)
+    names = _names(entries, path)
     poses: dict[str, Pose] = {}
     T_world_cam: Pose = np.eye(4)
     for index, (key, entry) in enumerate(entries.items()):
         if index:
             if "T_cn_cnm1" not in entry:
-                raise InputError(f"{path}: {key} has no T_cn_cnm1; calibrate its cameras together in one run.")
+                raise InputError(
+                    f"{path}: {key} has no T_cn_cnm1; give the chain that Kalibr wrote for all cameras of one run."
+                )
             where = f"{path}: {key}.T_cn_cnm1"
             T_world_cam = T_world_cam @ invert_transform(rigid_pose(matrix(entry["T_cn_cnm1"], where, (4, 4)), where))
         poses[names[key]] = T_world_cam
-    return Rig(T_world_cam=poses, cameras=_cameras(entries, names, path))
+    return Rig(T_world_cam=poses, origin="camera", cameras=_cameras(entries, names, path))
 
 
 def read_cameras(path: Path) -> Mapping[str, Camera]:
     """Intrinsics only; a chain is not needed."""
     entries = _entries(path)
-    return _cameras(entries, _names(entries), path)
+    return _cameras(entries, _names(entries, path), path)
 
 
 def _entries(path: Path) -> dict[str, dict[str, Any]]:
@@ -118,11 +122,26 @@ def _entries(path: Path) -> dict[str, dict[str, Any]]:
     return {key: content[key] for _, key in keys}
 
 
-def _names(entries: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Kalibr's name -> ours, from the topics if each has its own, else Kalibr's."""
-    topics = [word(entry.get("rostopic")) for entry in entries.values()]
-    found = [match[1] for topic in topics if (match := _TOPIC.fullmatch(topic))]
-    return dict(zip(entries, found if len(set(found)) == len(entries) else entries))
+def _names(entries: Mapping[str, Mapping[str, Any]], path: Path) -> dict[str, str]:
+    """Kalibr's name -> ours, from the topics where they have one, else Kalibr's."""
+    topics = {key: _TOPIC.fullmatch(word(entry.get("rostopic"))) for key, entry in entries.items()}
+    found = {key: match[1] for key, match in topics.items() if match}
+    names = {key: found.get(key, key) for key in entries}
+    if not found:
+        return names
+    if len(set(names.values())) < len(names):  # two cameras on one topic, or a topic called like another camera
+        logger.warning(
+            "{}: its topics do not tell its cameras apart, which are called {} as Kalibr does", path, listed(entries)
+        )
+        return {key: key for key in entries}
+    if nameless := entries.keys() - found.keys():
+        logger.warning(
+            "{}: {} keeps the name that Kalibr gave, as its rostopic is none like /NAME/image_raw; if the file was cut "
+            "short, copy it again",
+            path,
+            listed(nameless),
+        )
+    return names
 
 
 def _cameras(entries: Mapping[str, Mapping[str, Any]], names: Mapping[str, str], path: Path) -> dict[str, Camera]:

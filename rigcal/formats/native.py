@@ -18,10 +18,12 @@ import numpy as np
 from aruco.atomic import write_whole
 from aruco.errors import InputError
 from aruco.model import Calibration, CameraPose, UpAxis
-from aruco.pose_math import Pose, checked_pose, pose_text
+from aruco.pose_math import Pose, pose_text
+from rigcal.formats.rotations import rigid_pose
 
 FORMAT, VERSION = "rigcal.extrinsics", 1
-MAX_FILE_BYTES = 64 * 2**20
+# A hall of a hundred cameras takes 400 kB; Python's objects take thirty times as much as a file that is made for it.
+MAX_FILE_BYTES = 4 * 2**20
 UP_VECTORS: dict[UpAxis, list[int]] = {"+y": [0, 1, 0], "-y": [0, -1, 0]}
 
 
@@ -87,7 +89,7 @@ def json_bytes(content: Mapping[str, Any]) -> bytes:
 
 
 def read_poses(path: Path) -> dict[str, Pose]:
-    """Camera -> T_world_cam of an extrinsics file; unknown keys are ignored.
+    """Camera -> T_world_cam of an extrinsics file; unknown keys are ignored, rounded poses set to the nearest rotation.
 
     Raises:
         InputError: The file cannot be read or an entry has no rigid pose; the message names file and camera.
@@ -97,7 +99,31 @@ def read_poses(path: Path) -> dict[str, Pose]:
 
 def poses_of(content: Mapping[str, Any], path: Path) -> dict[str, Pose]:
     """The same, of a file that was read; see read_poses."""
-    return {name: _pose(entry, f"{path}: camera {name}") for name, entry in _cameras(content, path).items()}
+    check_version(content, path)
+    cameras = _cameras(content, path)
+    if not any(isinstance(entry, dict) and "pose" in entry for entry in cameras.values()):
+        _refuse_other_formats(path)
+    return {name: _pose(entry, f"{path}: camera {name}") for name, entry in cameras.items()}
+
+
+def check_version(content: Mapping[str, Any], path: Path) -> None:
+    """See that what an extrinsics file says of its own layout is what is read here; it may say nothing.
+
+    Raises:
+        InputError: It is another layout, or a newer one, whose poses may mean something else.
+    """
+    meta = content.get("_meta")
+    said = meta if isinstance(meta, dict) else {}
+    layout, version = said.get("format", FORMAT), said.get("version", VERSION)
+    if layout != FORMAT:
+        raise InputError(
+            f"{path}: says that it is {str(layout)[:40]!r} (_meta.format), not {FORMAT}; give an extrinsics file."
+        )
+    if version != VERSION or isinstance(version, bool):
+        raise InputError(
+            f"{path}: is an extrinsics file of version {str(version)[:40]}, and this program reads {VERSION}; update "
+            "it."
+        )
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -117,7 +143,7 @@ def read_json_and_digest(path: Path) -> tuple[dict[str, Any], str]:
             raise InputError(f"{path}: over {MAX_FILE_BYTES >> 20} MiB, which is not an extrinsics file.")
         raw = path.read_bytes()
         content = json.loads(
-            raw.decode("utf-8"), parse_constant=_finite, parse_float=_finite, object_pairs_hook=_untwinned
+            raw.decode("utf-8-sig"), parse_constant=_finite, parse_float=_finite, object_pairs_hook=_untwinned
         )
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
@@ -126,10 +152,31 @@ def read_json_and_digest(path: Path) -> tuple[dict[str, Any], str]:
     except _TwinsError as error:
         raise InputError(f"{path}: {error} is there twice in one object; rename or remove one of them.") from error
     except (ValueError, RecursionError) as error:
+        if not raw.lstrip().startswith(b"{"):
+            _refuse_other_formats(path)
         raise InputError(f"{path}: not a JSON file ({error}); give an extrinsics file.") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: not an extrinsics file: its root is not an object of cameras.")
     return content, hashlib.sha256(raw).hexdigest()
+
+
+def _refuse_other_formats(path: Path) -> None:
+    """Say of what is no extrinsics file what it is, if it is a calibration, or empty.
+
+    Raises:
+        InputError: It is.
+    """
+    from rigcal.formats import registry  # which reads every format, ours among them
+
+    try:
+        known = registry.detect(path).name if path.is_file() else "native"
+    except registry.UnknownFormatError:
+        return
+    if known != "native":
+        raise InputError(
+            f"{path}: is a calibration in another format ({known}); make an extrinsics file of it: rigcal convert "
+            f"{path} --to native -o extrinsics.json."
+        )
 
 
 def _finite(text: str) -> float:
@@ -161,7 +208,7 @@ class _TwinsError(ValueError):
 def _place_of(raw: bytes) -> str:
     """Where a file holds its first number that is none."""
     try:
-        content = json.loads(raw.decode("utf-8"))
+        content = json.loads(raw.decode("utf-8-sig"))
     except (ValueError, RecursionError):
         return "it"
     todo: list[tuple[str, Any]] = [("", content)]
@@ -186,9 +233,10 @@ def _pose(entry: Any, where: str) -> Pose:
     if not isinstance(text, str):
         raise InputError(f"{where} has no pose; it wants sixteen numbers, row by row.")
     try:
-        numbers = np.array([float(word) for word in text.split()])
-        return checked_pose(numbers.reshape(4, 4), "pose")
+        T = np.array([float(word) for word in text.split()]).reshape(4, 4)
     except ValueError as error:
         raise InputError(
             f"{where} has no sixteen numbers of a rigid transform ({error}); mend its pose or leave the camera out."
         ) from error
+    with np.errstate(over="ignore", invalid="ignore"):  # 1e308 makes a pose that is not rigid, and is refused as such
+        return rigid_pose(T, where)

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 from loguru import logger
 
 from aruco.errors import InputError
@@ -58,13 +57,12 @@ def read(path: Path) -> Rig:
         InputError: The file cannot be read, or an entry is not what it should be.
     """
     content = native.read_json(path)
+    native.check_version(content, path)
     meta = content.get("_meta")
     up, origin = _world(meta, path)
     _warn(meta if isinstance(meta, dict) else {}, path)
     cameras = _cameras(content, path)
-    with np.errstate(over="ignore"):  # a number like 1e308 makes a pose that is not rigid, and is refused as such
-        poses = native.poses_of(content, path)
-    return Rig(T_world_cam=poses, up=up, origin=origin, cameras=cameras)
+    return Rig(T_world_cam=native.poses_of(content, path), up=up, origin=origin, cameras=cameras)
 
 
 def _warn(meta: Mapping[str, Any], path: Path) -> None:
@@ -73,6 +71,9 @@ def _warn(meta: Mapping[str, Any], path: Path) -> None:
     apart = [name for part in parts if isinstance(part, dict) for name in part] if isinstance(parts, list) else []
     if apart := [name for name in apart if not name.startswith("_")]:
         logger.warning("{}: camera {} stands in a world of its own and is left out", path, listed(apart))
+    lost = meta.get("without_pose")
+    if isinstance(lost, dict) and lost:
+        logger.warning("{}: camera {} has no pose there and is left out", path, listed(lost))
     quality = meta.get("quality")
     if isinstance(quality, dict) and quality.get("verdict") == "bad":
         logger.warning("{}: this calibration calls itself bad; see _meta.quality.reasons there", path)
@@ -80,14 +81,16 @@ def _warn(meta: Mapping[str, Any], path: Path) -> None:
 
 def read_cameras(path: Path) -> Mapping[str, Camera]:
     """Intrinsics only."""
-    return _cameras(native.read_json(path), path)
+    content = native.read_json(path)
+    native.check_version(content, path)
+    return _cameras(content, path)
 
 
 def _world(meta: object, path: Path) -> tuple[Any, str]:
     world = meta.get("world") if isinstance(meta, dict) else None
     if world is None:
-        return None, "camera"
-    up, origin = (world.get("up"), world.get("origin", "target")) if isinstance(world, dict) else ("", "")
+        return None, "unknown"
+    up, origin = (world.get("up"), world.get("origin", "unknown")) if isinstance(world, dict) else ("", "")
     axis = next((axis for axis, vector in native.UP_VECTORS.items() if vector == up), None)
     if not isinstance(origin, str) or (up is not None and axis is None):
         raise InputError(

@@ -13,7 +13,7 @@ lies right. ``orientation_override`` keeps nerfstudio from turning a world uprig
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from aruco.model import Camera, DistortionModel, UpAxis
 from aruco.pose_math import Array, Pose
 from rigcal.formats.image_names import image_name
 from rigcal.formats.native import read_json, write_json
-from rigcal.formats.reading import matrix, number, placed, whole, word
+from rigcal.formats.reading import MAX_NUMBER, matrix, number, placed, whole, word
 from rigcal.formats.rig import (
     HALF_PIXEL,
     HALF_TURN_X,
@@ -125,7 +125,7 @@ def read(path: Path) -> Rig:
                 f"{where}: camera {name} is there twice; only a rig at rest can be read, one image a camera."
             )
         T_file_gl = rigid_pose(_padded(frame.get("transform_matrix"), f"{where}: transform_matrix"), where)
-        T_file_gl[:3, 3] /= scale
+        T_file_gl[:3, 3] = _unscaled(T_file_gl[:3, 3], scale, where)
         poses[name] = R_world_file @ T_file_gl @ HALF_TURN_X
         camera = _camera(name, {**frame, **content}, where)
         cameras.update({} if camera is None else {name: camera})
@@ -154,6 +154,15 @@ def _world(content: Mapping[str, Any], path: Path) -> tuple[UpAxis | None, Pose,
     return up if up in ("+y", "-y") else None, T_world_file, scale
 
 
+def _unscaled(t_file: Array, scale: float, where: str) -> Array:
+    """A place (3,) in metres."""
+    with np.errstate(over="ignore"):
+        t = t_file / scale
+    if not (np.abs(t) <= MAX_NUMBER).all():
+        raise InputError(f"{where}: its place divided by the file's applied_scale of {scale:g} is none; mend the file.")
+    return t
+
+
 def _padded(value: object, where: str) -> Array:
     """A (4, 4) matrix, of which a file may leave out the last row."""
     short = isinstance(value, list) and len(value) == 3
@@ -167,8 +176,8 @@ def _camera_name(frame: Mapping[str, Any], where: str) -> str:
     if not isinstance(name, str):
         if not isinstance(image, str):
             raise InputError(f"{where}: has no file_path; mend or remove it.")
-        name = image.removeprefix("./").removeprefix("images/").rpartition(".")[0] or image
-        name = name.replace("/", "-")
+        path = PurePosixPath(image.removeprefix("./").removeprefix("images/"))
+        name = str(path.parent / path.stem).replace("/", "-")  # not every file's names have a suffix
     check_name(name, where)
     return name
 
@@ -177,10 +186,7 @@ def _camera(name: str, keys: Mapping[str, Any], where: str) -> Camera | None:
     """The lens of a frame, whose keys count where the file's root has none; None where no focal length is given."""
     if "fl_x" not in keys:
         return None
-    model = word(keys.get("camera_model", "OPENCV"))
-    if model not in _MODELS:
-        raise InputError(f"{where}: camera_model {model!r} has no counterpart here; known: {', '.join(_MODELS)}.")
-    kind = _MODELS[model]
+    kind = _kind(keys, where)
 
     def told(key: str, default: object = None) -> float:
         return number(keys.get(key, default), f"{where}: {key}")
@@ -193,6 +199,21 @@ def _camera(name: str, keys: Mapping[str, Any], where: str) -> Camera | None:
     width, height = whole(keys.get("w"), f"{where}: w"), whole(keys.get("h"), f"{where}: h")
     with placed(where):
         return Camera(name=name, width=width, height=height, K=K, distortion_model=kind, distortion=distortion)
+
+
+def _kind(keys: Mapping[str, Any], where: str) -> DistortionModel:
+    """The model that a file names, or as instant-ngp's do: a fisheye or not."""
+    fisheye = keys.get("is_fisheye", False)
+    if not isinstance(fisheye, bool):
+        raise InputError(f"{where}: is_fisheye must be true or false; mend the file.")
+    model = word(keys.get("camera_model", "OPENCV_FISHEYE" if fisheye else "OPENCV"))
+    if model not in _MODELS:
+        raise InputError(f"{where}: camera_model {model!r} has no counterpart here; known: {', '.join(_MODELS)}.")
+    if fisheye and _MODELS[model] != "equidistant":
+        raise InputError(
+            f"{where}: is_fisheye is true, and camera_model {model} is no fisheye's; remove the wrong one."
+        )
+    return _MODELS[model]
 
 
 def recognises(path: Path, head: bytes) -> bool:

@@ -3,7 +3,8 @@
 Owns      the layout, which Open3D's own reader takes: matrices column by column.
 Leaves    JSON to native.
 
-A member ``name`` a camera and ``world_up`` are additions, which Open3D ignores.
+Open3D has no lens distortion. The members ``name``, ``distortion_model`` and ``distortion_coefficients`` of a camera
+and ``world_up`` are additions, which it ignores, and drops where it writes the file anew.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 from loguru import logger
 
 from aruco.errors import InputError
-from aruco.model import Camera
+from aruco.model import Camera, DistortionModel
 from aruco.pose_math import Pose, invert_transform
 from rigcal.formats import native
 from rigcal.formats.reading import numbers, placed, whole, word
@@ -43,8 +44,8 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     """
     if bent := [name for name, camera in rig.cameras.items() if camera.has_distortion]:
         logger.warning(
-            "open3d has no place for lens distortion, and camera {} has some: its intrinsics hold for images that were "
-            "undistorted to the same camera matrix",
+            "Open3D has no lens distortion, and camera {} has some: its intrinsics there hold for images that were "
+            "undistorted to the same camera matrix; its coefficients stand in members that Open3D ignores",
             listed(bent),
         )
     content = {
@@ -61,6 +62,8 @@ def _parameters(T_world_cam: Pose, camera: Camera) -> dict[str, Any]:
     return {
         "class_name": PARAMETERS,
         "name": camera.name,
+        "distortion_model": camera.distortion_model,
+        "distortion_coefficients": camera.distortion.tolist(),
         "extrinsic": steady(invert_transform(T_world_cam).ravel(order="F")).tolist(),
         "intrinsic": {
             "height": camera.height,
@@ -106,16 +109,26 @@ def _entries(content: Mapping[str, Any], path: Path) -> dict[str, Mapping[str, A
 
 
 def _cameras(entries: Mapping[str, Mapping[str, Any]], path: Path) -> dict[str, Camera]:
-    return {name: _camera(name, entry.get("intrinsic"), f"{path}: camera {name}") for name, entry in entries.items()}
+    if bare := listed(name for name, entry in entries.items() if "distortion_coefficients" not in entry):
+        logger.warning(
+            "{}: Open3D's format has no place for lens distortion, so camera {} is taken for a pinhole, which holds "
+            "for images that were undistorted, not as they were recorded",
+            path,
+            bare,
+        )
+    return {name: _camera(name, entry, f"{path}: camera {name}") for name, entry in entries.items()}
 
 
-def _camera(name: str, given: object, where: str) -> Camera:
+def _camera(name: str, entry: Mapping[str, Any], where: str) -> Camera:
+    given = entry.get("intrinsic")
     if not isinstance(given, dict):
         raise InputError(f"{where} has no intrinsic; give a trajectory as Open3D writes it.")
     width, height = whole(given.get("width"), f"{where}: width"), whole(given.get("height"), f"{where}: height")
     K = numbers(given.get("intrinsic_matrix"), f"{where}: intrinsic_matrix", 9).reshape(3, 3, order="F")
+    model: DistortionModel = entry.get("distortion_model", "plumb_bob")
+    distortion = numbers(entry.get("distortion_coefficients", []), f"{where}: distortion_coefficients")
     with placed(where):
-        return Camera(name=name, width=width, height=height, K=K)
+        return Camera(name=name, width=width, height=height, K=K, distortion_model=model, distortion=distortion)
 
 
 def recognises(path: Path, head: bytes) -> bool:
@@ -129,8 +142,8 @@ FORMAT = Format(
     explain=(
         "Open3D PinholeCameraTrajectory JSON: extrinsic maps world to camera (inverse of T_world_cam), 16 numbers "
         "column by column, metres, camera axes x right, y down, z forward, the calibration's own world; "
-        "intrinsic_matrix is column by column too; no distortion: undistort images first; names stand in a member that "
-        "Open3D ignores."
+        "intrinsic_matrix is column by column too; Open3D has no distortion: undistort images first; names and "
+        "distortion stand in members that it ignores."
     ),
     put=write,
     read=read,

@@ -15,12 +15,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from loguru import logger
 
 from aruco.atomic import write_whole
 from aruco.errors import InputError
 from aruco.model import Camera
 from aruco.pose_math import Array, Pose, invert_transform, matrix_to_rvec_tvec, rvec_tvec_to_matrix
-from rigcal.formats.reading import MAX_YAML_BYTES, numbers, parsed_xml, placed, read_text, whole, word, yaml_mapping
+from rigcal.formats.reading import (
+    MAX_YAML_BYTES,
+    numbers,
+    parsed_xml,
+    placed,
+    read_text,
+    warn_of_cut,
+    whole,
+    word,
+    yaml_mapping,
+)
 from rigcal.formats.rig import (
     UP_WORDS,
     ExportOptions,
@@ -33,6 +44,8 @@ from rigcal.formats.rotations import rigid_pose, steady
 WHAT = "a YAML or XML file of OpenCV's FileStorage"
 # How far rvec and tvec may be from T_world_cam [rad, m]: somebody changed only one of the two.
 AGREED = 1e-6
+# cv2 writes and reads no line longer than 4096 bytes; the name's key and indent are on it too.
+MAX_TEXT_BYTES = 4000
 
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
@@ -52,9 +65,8 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
         storage.write("world_up", rig.up)
     storage.startWriteStruct("cameras", cv2.FileNode_SEQ)
     for name, T_world_cam in rig.T_world_cam.items():
-        _check_text(name, out)
         storage.startWriteStruct("", cv2.FileNode_MAP)
-        storage.write("name", name)
+        storage.write("name", _quoted(name, out))
         if name in rig.cameras:
             _write_lens(storage, rig.cameras[name])
         rvec, tvec = matrix_to_rvec_tvec(invert_transform(T_world_cam))
@@ -65,12 +77,15 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
     write_whole(out, storage.releaseAndGetString().encode())
 
 
-def _check_text(name: str, out: Path) -> None:
-    if "'" in name or name != name.strip(' "'):  # cv2 writes them without the quotes that YAML wants
-        raise InputError(
-            f"{out}: opencv cannot hold the name {name[:80]!r}, with an apostrophe, or a blank or a quote at its edge; "
-            "rename the camera."
-        )
+def _quoted(name: str, out: Path) -> str:
+    """A name in quotes, which cv2 then leaves as they are.
+
+    Its own it forgets around true, which OpenCV 5 takes for a number, and around apostrophes and outer blanks.
+    """
+    quoted = '"' + name.replace('"', '\\"') + '"'
+    if len(quoted.encode()) > MAX_TEXT_BYTES:
+        raise InputError(f"{out}: opencv cannot hold the name {name[:80]!r}..., which is too long; rename the camera.")
+    return quoted
 
 
 def _write_lens(storage: Any, camera: Camera) -> None:
@@ -114,9 +129,10 @@ def _parsed(path: Path) -> dict[str, Any]:
     text = read_text(path, WHAT, MAX_YAML_BYTES)
     if text.lstrip().startswith("<"):
         return _of_xml(text, path)
-    # The directive is no YAML: %YAML:1.0 instead of %YAML 1.0.
-    head, _, rest = text.partition("\n")
-    return yaml_mapping(rest if head.startswith("%YAML") else text, path, WHAT)
+    content = yaml_mapping(text, path, WHAT)
+    if not text.lstrip().startswith("{"):  # JSON that is cut cannot be read
+        warn_of_cut(text, path)
+    return content
 
 
 def _of_xml(text: str, path: Path) -> dict[str, Any]:
@@ -167,17 +183,23 @@ def _camera(name: str, lens: Mapping[str, Any], where: str) -> Camera:
             width=width,
             height=height,
             K=K,
-            distortion_model=_model(lens, len(distortion)),
+            distortion_model=_model(lens, len(distortion), where),
             distortion=distortion,
         )
 
 
-def _model(lens: Mapping[str, Any], count: int) -> Any:
+def _model(lens: Mapping[str, Any], count: int, where: str) -> Any:
     """What the file says, in our word or as OpenCV's samples do, else what so many coefficients mean to OpenCV."""
     if "distortion_model" in lens:
         return word(lens["distortion_model"])
     if word(lens.get("fisheye_model")) in ("1", "true"):
         return "equidistant"
+    if count == 4 and "fisheye_model" not in lens:
+        logger.warning(
+            "{}: does not say what its four distortion coefficients are, and they are read as k1, k2, p1, p2 of an "
+            "ordinary lens; if they are of cv2.fisheye, add the line fisheye_model: 1",
+            where,
+        )
     return "rational_polynomial" if count > 5 else "plumb_bob"
 
 

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import yaml
+from loguru import logger
 
 from aruco.errors import InputError
 from aruco.pose_math import Array
@@ -48,13 +49,31 @@ def read_text(path: Path, what: str, limit: int = MAX_FILE_BYTES) -> str:
         raise InputError(f"{path}: not UTF-8 text ({error.reason} at byte {error.start}); give {what}.") from error
 
 
+def warn_of_cut(text: str, path: Path) -> None:
+    """Say that a file of lines ends within one: nobody can tell whether the last number or name there is whole."""
+    if not is_of_whole_lines(text):
+        logger.warning(
+            "{}: ends without the end of a line; if it was cut short, its last number or name is not whole, so copy it "
+            "again",
+            path,
+        )
+
+
+def is_of_whole_lines(text: str) -> bool:
+    """Whether a text ends where a line ends, or holds nothing."""
+    return not text.strip() or text.endswith(("\n", "\r"))
+
+
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
     """The mapping at the root of a YAML file; every scalar is left a text.
 
     Raises:
         InputError: It cannot be read, or its root is none.
     """
-    return yaml_mapping(read_text(path, what, MAX_YAML_BYTES), path, what)
+    text = read_text(path, what, MAX_YAML_BYTES)
+    content = yaml_mapping(text, path, what)
+    warn_of_cut(text, path)
+    return content
 
 
 class _TwinsError(ValueError):
@@ -73,7 +92,8 @@ class _Loader(yaml.BaseLoader):
 
 
 def yaml_mapping(text: str, path: Path, what: str) -> dict[str, Any]:
-    """The same, of the text of a file that was read."""
+    """The same, of a text that was read, without a directive such as OpenCV's %YAML:1.0, which is no YAML."""
+    text = re.sub(r"\A%YAML[^\r\n]*", "", text)  # the line stays: messages count lines
     try:
         # The base loader makes no objects: safer than the safe one, and YAML 1.1's idea that 1e-05 is a word and
         # 010 is eight does not matter.

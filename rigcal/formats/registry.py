@@ -6,6 +6,7 @@ Leaves    each layout to its own file. Light to import, so that --help answers a
 
 from __future__ import annotations
 
+import codecs
 import os
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -59,11 +60,21 @@ def detect(path: Path) -> Format:
         InputError: It cannot be read, or nobody knows it.
     """
     head = _head(path)
+    if not head.strip(b"\0 \t\r\n") and not os.path.isdir(path):
+        raise InputError(f"{path}: {_nothing_in(head)}, so it is no calibration; copy or make it again.")
     for name in NAMES:
         known = format_named(name)
         if known.recognises(path, head):
             return known
     raise UnknownFormatError(f"{path}: not a calibration in a format that is known here; known: {', '.join(NAMES)}.")
+
+
+def format_of(path: Path) -> str | None:
+    """The name of the format that a file or folder is in; None: it is no calibration that is known here."""
+    try:
+        return detect(path).name
+    except InputError:
+        return None
 
 
 def read_rig(path: Path) -> Rig:
@@ -98,6 +109,11 @@ def _check_names(names: Iterable[str], path: Path) -> None:
         check_name(name, path)
 
 
+def _nothing_in(head: bytes) -> str:
+    """What a file is that begins with nothing that could be read."""
+    return "is empty" if not head else "holds nothing but zeros and blanks" if b"\0" in head else "holds only blanks"
+
+
 def _head(path: Path) -> bytes:
     try:
         if os.path.isdir(path):
@@ -105,6 +121,6 @@ def _head(path: Path) -> bytes:
         if os.path.exists(path) and not os.path.isfile(path):
             raise InputError(f"{path}: is not a file; give a calibration.")  # opening a pipe would wait for ever
         with path.open("rb") as stream:
-            return stream.read(HEAD_BYTES)
+            return stream.read(HEAD_BYTES).removeprefix(codecs.BOM_UTF8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error

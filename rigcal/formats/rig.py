@@ -35,7 +35,7 @@ class Rig:
 
     T_world_cam: Mapping[str, Pose]  # sorted by name
     up: UpAxis | None = None  # which axis of the world points against gravity; None: unknown
-    origin: str = "camera"  # what the world's origin is tied to: "target", "floor", "camera"
+    origin: str = "unknown"  # what the world's origin is tied to: "target", "floor", "camera", or nobody knows
     cameras: Mapping[str, Camera] = field(default_factory=dict)  # intrinsics, where known; sorted by name
 
     def __post_init__(self) -> None:
@@ -140,11 +140,15 @@ def check_up(rig: Rig, who: str) -> None:
     Raises:
         InputError: It does not; ``who`` is the format that wants to know.
     """
-    if rig.up is None:
-        raise InputError(
-            f"{who} wants a world that stands upright, and this calibration does not say which way is up; calibrate "
-            "again with --auto-align."
-        )
+    if rig.up is not None:
+        return
+    wish = f"{who} wants a world that stands upright, and this calibration does not say which way is up; "
+    if rig.origin not in ("camera", "unknown"):  # rigcal's own: nobody else ties a world to a target or a floor
+        raise InputError(f"{wish}calibrate again with --auto-align.")
+    raise InputError(
+        f"{wish}convert rigcal's own extrinsics of this rig instead, or, if you know that +y of its world points up, "
+        "convert it to native first and write [0, 1, 0] for up under _meta.world there."
+    )
 
 
 def check_cameras(rig: Rig, who: str) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from loguru import logger
 
 from aruco.atomic import write_whole
 from aruco.errors import InputError
@@ -33,6 +34,16 @@ _XYZ, _XYZW, _RPY = ("--x", "--y", "--z"), ("--qx", "--qy", "--qz", "--qw"), ("-
 _FRAMES = ("--frame-id", "--child-frame-id")
 # Without flags, as ROS 2 took them before Humble: with Euler angles, with a quaternion.
 _UNFLAGGED = {8: (*_XYZ, "--yaw", "--pitch", "--roll", *_FRAMES), 9: (*_XYZ, *_XYZW, *_FRAMES)}
+# ROS 1's tf, not its tf2_ros, wants a period [ms] after them.
+_WITH_PERIOD = (9, 10)
+# $(var x) in XML; inner ones first, as deep as anybody writes.
+_SUBSTITUTION = re.compile(r"\$\([^()]*\)")
+_MAX_NESTED = 8
+# What stands for one in the meantime: no XML holds it.
+_COMPUTED = "\0"
+_NOT_RUN = "computed, and a launch file is not run here"
+# A word of a publisher's arguments; None: it is computed.
+Word = str | None
 
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
@@ -55,7 +66,7 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
 
 
 def read(path: Path) -> Rig:
-    """The cameras of a launch file, in a world with Y up. A Python file is not run: its arguments must be literals.
+    """The cameras of a launch file, in a world with Y up. It is not run: what places a camera must be literal.
 
     Raises:
         InputError: It cannot be read, or its transforms are not literal; the message names the file.
@@ -63,11 +74,20 @@ def read(path: Path) -> Rig:
     text = read_text(path, _WHAT, MAX_FILE_BYTES)
     publishers = _in_xml(text, path) if text.lstrip().startswith("<") else _in_python(text, path)
     links: dict[str, Link] = {}
-    for nth, words_of_one in enumerate(publishers, start=1):
-        parent, child, T_parent_child = _transform(words_of_one, f"{path}: {PROGRAM} {nth}")
+    unread: list[str] = []
+    for where, arguments in publishers:
+        said = _flags(arguments, where)
+        if said is None:
+            unread.append(f"{where}: the arguments of this {PROGRAM} are {_NOT_RUN}")
+            continue
+        child, link = _link(said, where)
         if child in links:
             raise InputError(f"{path}: frame {child!r} is published twice; remove one of the transforms.")
-        links[child] = Link(parent=parent, T_parent_child=T_parent_child)
+        links[child] = link
+    if unread and not links:
+        raise InputError(f"{unread[0]}; write them as texts.")
+    for reason in unread:
+        logger.warning("{}; it is left out, so write them as texts if a camera hangs on it", reason)
     return rig_of(links, text, path)
 
 
@@ -127,17 +147,24 @@ def _xml(publishers: Mapping[str, Sequence[str]], about: Sequence[str]) -> str:
     return ElementTree.tostring(launch, encoding="unicode") + "\n"
 
 
-def _in_xml(text: str, path: Path) -> Iterator[Sequence[str]]:
+def _in_xml(text: str, path: Path) -> Iterator[tuple[str, Sequence[Word]]]:
+    """Where each publisher stands, and its arguments."""
     root = parsed_xml(text, path, _WHAT)
-    for node in root.iter("node"):
-        if node.get("exec", node.get("type")) == PROGRAM:
-            try:
-                yield shlex.split(node.get("args", ""))
-            except ValueError as error:
-                raise InputError(f"{path}: the args of a {PROGRAM} cannot be parted ({error}); mend them.") from error
+    nodes = (node for node in root.iter("node") if node.get("exec", node.get("type")) == PROGRAM)
+    for nth, node in enumerate(nodes, start=1):
+        where, said = f"{path}: {PROGRAM} {nth}", node.get("args", "")
+        for _ in range(_MAX_NESTED):
+            said = _SUBSTITUTION.sub(_COMPUTED, said)
+        try:
+            arguments = [None if _COMPUTED in word else word for word in shlex.split(said)]
+        except ValueError as error:
+            raise InputError(f"{where}: its args cannot be parted ({error}); mend them.") from error
+        has_period = node.get("pkg") == "tf" and len(arguments) in _WITH_PERIOD
+        yield where, arguments[:-1] if has_period else arguments
 
 
-def _in_python(text: str, path: Path) -> Iterator[Sequence[str]]:
+def _in_python(text: str, path: Path) -> Iterator[tuple[str, Sequence[Word]]]:
+    """The same."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about the style of somebody else's file
@@ -149,48 +176,66 @@ def _in_python(text: str, path: Path) -> Iterator[Sequence[str]]:
             said = {keyword.arg: keyword.value for keyword in call.keywords}
             program = said.get("executable", said.get("node_executable"))
             if isinstance(program, ast.Constant) and program.value == PROGRAM:
-                yield _literals(said.get("arguments"), f"{path}: line {call.lineno}")
+                yield f"{path}: line {call.lineno}", _literals(said.get("arguments"))
 
 
-def _literals(arguments: ast.expr | None, where: str) -> Sequence[str]:
+def _literals(arguments: ast.expr | None) -> Sequence[Word]:
+    if arguments is None:
+        return []
     items = arguments.elts if isinstance(arguments, ast.List | ast.Tuple) else [arguments]
-    if not all(isinstance(item, ast.Constant) for item in items):
-        raise InputError(
-            f"{where}: the arguments of this {PROGRAM} are computed, and a launch file is not run here; write them as "
-            "a list of texts."
-        )
-    return [str(item.value) for item in items if isinstance(item, ast.Constant)]
+    if any(isinstance(item, ast.Starred) for item in items):
+        return [None]  # nobody knows how many
+    return [str(item.value) if isinstance(item, ast.Constant) else None for item in items]
 
 
-def _transform(arguments: Sequence[str], where: str) -> tuple[str, str, Pose]:
-    """Parent, child and T_parent_child of one publisher."""
-    said = _flags(arguments, where)
-    parent, child = (re.sub("^/", "", said.pop(flag, "")) for flag in _FRAMES)
+def _link(said: Mapping[str, Word], where: str) -> tuple[str, Link]:
+    """The child of one publisher, and where it is in its parent."""
+    parent, child = (re.sub("^/", "", said.get(flag) or "") for flag in _FRAMES)
     if not parent or not child:
         raise InputError(f"{where}: lacks --frame-id or --child-frame-id; give both.")
-    values = {flag: number(word, f"{where}: {flag}") for flag, word in said.items()}
+    words_of = {flag: word for flag, word in said.items() if flag not in _FRAMES}
+    if None in words_of.values():
+        unknown = f"is placed by numbers that are {_NOT_RUN}; write them as texts"
+        return child, Link(parent=parent, T_parent_child=None, unknown=unknown)
+    values = {flag: number(word, f"{where}: {flag}") for flag, word in words_of.items()}
     if values.keys() & set(_RPY) and values.keys() & set(_XYZW):
         raise InputError(f"{where}: gives both a quaternion and roll, pitch, yaw; remove one of them.")
     if values.keys() & set(_XYZW):
         R = rotation_of_xyzw(_values(values, _XYZW, (0.0, 0.0, 0.0, 1.0)), where)
     else:
         R = rotation_of_rpy(_values(values, _RPY))
-    return parent, child, make_pose(R, _values(values, _XYZ))
+    return child, Link(parent=parent, T_parent_child=make_pose(R, _values(values, _XYZ)))
 
 
 def _values(values: Mapping[str, float], flags: Sequence[str], default: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
     return np.array([values.get(flag, rest) for flag, rest in zip(flags, default, strict=True)])
 
 
-def _flags(arguments: Sequence[str], where: str) -> dict[str, str]:
-    """Flag -> word, of arguments with flags or in the old order without."""
-    if len(arguments) in _UNFLAGGED and not any(word.startswith("--") for word in arguments):
-        return dict(zip(_UNFLAGGED[len(arguments)], arguments, strict=True))
-    known = (*_XYZ, *_XYZW, *_RPY, *_FRAMES)
-    strange = [word for word in arguments[::2] if word not in known]
-    if strange or len(arguments) % 2:
-        raise InputError(f"{where}: {(strange or arguments)[-1][:40]!r} is not understood; known: {', '.join(known)}.")
-    return dict(zip(arguments[::2], arguments[1::2], strict=True))
+def _flags(arguments: Sequence[Word], where: str) -> Mapping[str, Word] | None:
+    """Flag -> word, of arguments with flags or in the old order without; None: which frames are meant is computed."""
+    arguments = _without_ros_args(arguments)
+    if len(arguments) in _UNFLAGGED and not any(word is not None and word.startswith("--") for word in arguments):
+        said = dict(zip(_UNFLAGGED[len(arguments)], arguments, strict=True))
+    else:
+        flags = arguments[::2]
+        known = (*_XYZ, *_XYZW, *_RPY, *_FRAMES)
+        strange = [word for word in flags if word not in known]
+        if (strange or len(arguments) % 2) and None in arguments:
+            return None
+        if strange or len(arguments) % 2:
+            odd = (strange or arguments)[-1] or ""
+            raise InputError(f"{where}: {odd[:40]!r} is not understood; known: {', '.join(known)}.")
+        said = {flag: word for flag, word in zip(flags, arguments[1::2], strict=True) if flag is not None}
+    return None if any(flag in said and said[flag] is None for flag in _FRAMES) else said
+
+
+def _without_ros_args(arguments: Sequence[Word]) -> Sequence[Word]:
+    """What is left for the program: ROS takes what stands between --ros-args and -- or the end."""
+    if "--ros-args" not in arguments:
+        return arguments
+    first = arguments.index("--ros-args")
+    rest = arguments[first + 1 :]
+    return [*arguments[:first], *(rest[rest.index("--") + 1 :] if "--" in rest else [])]
 
 
 FORMAT = Format(

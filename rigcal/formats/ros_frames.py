@@ -4,13 +4,14 @@ Owns      which names ROS takes, the reversible spelling of all others, the note
           are named, walking a tree of transforms.
 Leaves    what a launch file and a URDF look like to their own files.
 
-The world is REP-103's, Z up; a camera's frame is optical: x right, y down, z forward.
+The world is REP-103's, Z up; a camera's frame is optical: x right, y down, z forward. A tree of others may hang from a
+camera instead, of which nobody knows how it is tilted.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,20 +29,33 @@ MAX_DEPTH = 64
 MAX_NAME = 255
 _FRAME = re.compile("[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*")
 _NOTE = "Camera frames are named"
-_DEFAULT_PATTERNS = (ExportOptions().frame_name, "{camera}_optical_frame")
+# ZED's wrapper before and since 5.1, then all others. A ZED's right eye is no camera of its own, so its left one goes
+# first.
+_DEFAULT_PATTERNS = (
+    ExportOptions().frame_name,
+    "{camera}_left_camera_frame_optical",
+    "{camera}_optical_frame",
+    "{camera}_frame_optical",
+)
+# zed_camera_link, cam0, camera_color_optical_frame: bodies that are mounted at any tilt.
+_CAMERAS_OWN = re.compile("(^|[_/])cam(era)?[0-9]*($|[_/])|(^|[_/])optical(_frame)?$", re.IGNORECASE)
+# What comes back as another sign: such parts of names are spelt too.
+_LIKE_SPELT = "_(?=x[0-9a-f]{1,6}(?:_|[^A-Za-z0-9_]))"
+MOVES = "moves; give a file with fixed cameras"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Link:
-    """A frame's place in its parent; without a pose it moves."""
+    """A frame's place in its parent."""
 
     parent: str
-    T_parent_child: Pose | None
+    T_parent_child: Pose | None  # None: not known
+    unknown: str = MOVES  # what such a frame does, and what to do about it
 
 
 def frame_of(camera: str, pattern: str) -> str:
     """The frame of a camera. What ROS does not take in a name is spelt ``_x<hex>_``, so that the name comes back."""
-    spelt = re.sub("[^A-Za-z0-9_]|_(?=x)", lambda found: f"_x{ord(found.group()):x}_", camera)
+    spelt = re.sub(f"[^A-Za-z0-9_]|{_LIKE_SPELT}", lambda found: f"_x{ord(found.group()):x}_", camera)
     return filled(pattern, spelt)
 
 
@@ -72,11 +86,28 @@ def frames_of(rig: Rig, options: ExportOptions, who: str) -> dict[str, str]:
                 "parted by single slashes; choose another one."
             )
     frames = {camera: frame_of(camera, options.frame_name) for camera in rig.T_world_cam}
+    _refuse_long(frames, options, who)
     if options.parent_frame in frames.values():
         raise InputError(
             f"{who}: --parent-frame {options.parent_frame} is the frame of a camera as well; choose another one."
         )
     return frames
+
+
+def _refuse_long(frames: Mapping[str, str], options: ExportOptions, who: str) -> None:
+    """See that every name that is written is short enough to be read.
+
+    Raises:
+        InputError: One is not.
+    """
+    long = {camera: frame for camera, frame in frames.items() if len(frame) > MAX_NAME}
+    if len(options.frame_name) > MAX_NAME or len(options.parent_frame) > MAX_NAME:
+        raise InputError(f"{who}: --parent-frame and --frame-name have {MAX_NAME} signs at most; give shorter ones.")
+    for camera, frame in long.items():
+        raise InputError(
+            f"{who}: the frame of camera {camera[:40]!r}... would have {len(frame)} signs, and names of frames have "
+            f"{MAX_NAME} at most; rename the camera or give a shorter --frame-name."
+        )
 
 
 def note(options: ExportOptions) -> str:
@@ -96,31 +127,58 @@ def upright(rig: Rig, who: str) -> dict[str, Pose]:
 def rig_of(links: Mapping[str, Link], text: str, path: Path) -> Rig:
     """The cameras among the frames of a file's ``text``, in the world at the root of its tree, turned to Y up.
 
+    A tree that hangs from a camera keeps that camera's axes for its world: a camera may be tilted, so up is unknown.
+
     Args:
         links: Every frame that has a parent -> where it is in it.
         text: The file, which may say how the frames of cameras are named.
         path: For messages.
 
     Raises:
-        InputError: No frame is a camera's, they hang from several roots, or one hangs on something that moves.
+        InputError: No frame is a camera's, they hang from several roots, or from something that has no place.
     """
-    cameras = _cameras(links, text, path)
+    stated = _stated_pattern(text)
+    ours = _named_by(stated, links) if stated else {}
+    cameras = ours or _cameras(links, path)
     placed = {camera: _placed(frame, links, path) for camera, frame in cameras.items()}
     if len(roots := {root for root, _ in placed.values()}) > 1:
         raise InputError(f"{path}: its cameras hang from several roots ({listed(roots)}); give a file with one world.")
+    # A file of ours says that its root has z up, whatever that is called.
+    if not ours and _CAMERAS_OWN.search(root := roots.pop()):
+        logger.warning(
+            "{}: its frames hang from {}, a camera's, which may be tilted, so which way is up stays unknown; a root "
+            "called world or map is taken to have z up",
+            path,
+            root,
+        )
+        return Rig(T_world_cam={camera: T for camera, (_, T) in placed.items()}, origin="camera")
     return Rig(T_world_cam={camera: y_up_of_z_up(T) for camera, (_, T) in placed.items()}, up="+y")
 
 
-def _cameras(links: Mapping[str, Link], text: str, path: Path) -> dict[str, str]:
-    """Camera -> frame: by the pattern that the file states, else by the usual endings, else all ends of the tree."""
+def _stated_pattern(text: str) -> str | None:
+    """How a file says that its cameras' frames are named."""
     stated = re.search(f"{_NOTE} ([A-Za-z0-9_/{{}}]{{1,{MAX_NAME}}})", text)
-    for pattern in (stated.group(1),) if stated and CAMERA_WORD in stated.group(1) else _DEFAULT_PATTERNS:
-        if found := {camera: frame for frame in links if (camera := camera_of(frame, pattern))}:
-            return found
+    return stated.group(1) if stated and CAMERA_WORD in stated.group(1) else None
+
+
+def _named_by(pattern: str, frames: Iterable[str]) -> dict[str, str]:
+    """Camera -> frame, of the frames that follow a pattern."""
+    return {camera: frame for frame in frames if (camera := camera_of(frame, pattern))}
+
+
+def _cameras(links: Mapping[str, Link], path: Path) -> dict[str, str]:
+    """Camera -> frame: by the usual endings, else all ends of the tree; its root too, where that is a camera."""
     parents = {link.parent for link in links.values()}
+    roots = sorted(parents - links.keys())
+    for pattern in _DEFAULT_PATTERNS:
+        found = _named_by(pattern, (*links, *roots))
+        if links.keys() & set(found.values()):
+            _say_left_out({*links, *roots} - set(found.values()), pattern, path)
+            return found
     ends = {frame: frame for frame in links if frame not in parents}
     if not ends:
         raise InputError(f"{path}: holds no frame of a camera; give a file with a transform for each camera.")
+    ends |= {root: root for root in roots if _is_optical(root)}
     logger.warning(
         "{}: no frame is named as an optical one; {} are taken for cameras with z forward, x right, y down",
         path,
@@ -129,13 +187,23 @@ def _cameras(links: Mapping[str, Link], text: str, path: Path) -> dict[str, str]
     return ends
 
 
+def _say_left_out(frames: Iterable[str], pattern: str, path: Path) -> None:
+    if left_out := listed(frame for frame in frames if _is_optical(frame)):
+        logger.warning("{}: cameras are the frames named {} here; {} are left out", path, pattern, left_out)
+
+
+def _is_optical(frame: str) -> bool:
+    return any(camera_of(frame, pattern) for pattern in _DEFAULT_PATTERNS)
+
+
 def _placed(frame: str, links: Mapping[str, Link], path: Path) -> tuple[str, Pose]:
     """The root above a frame, and the frame's pose in it."""
     T_root_frame, at, seen = np.eye(4), frame, {frame}
     while at in links:
         link = links[at]
         if link.T_parent_child is None:
-            raise InputError(f"{path}: frame {frame} hangs on {at}, which moves; give a file with fixed cameras.")
+            hung = "" if at == frame else f" hangs on {at}, which"
+            raise InputError(f"{path}: frame {frame}{hung} {link.unknown}.")
         T_root_frame, at = link.T_parent_child @ T_root_frame, link.parent
         if at in seen:
             raise InputError(f"{path}: frame {frame} hangs in a circle of frames; mend its parents.")

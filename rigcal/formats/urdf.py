@@ -9,6 +9,7 @@ x (roll), then y (pitch), then z (yaw).
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -22,6 +23,8 @@ from rigcal.formats.rotations import nearest_rotation, rotation_of_rpy, rpy_of_r
 
 NAME = "urdf"
 _WHAT = "a URDF"
+# Its namespace had several addresses. Expanded files keep the declaration, which says nothing.
+_XACRO = re.compile(r"\{https?://[^}]*xacro[^}]*\}")
 
 
 def write(rig: Rig, out: Path, options: ExportOptions) -> None:
@@ -53,7 +56,7 @@ def read(path: Path) -> Rig:
     robot = parsed_xml(text, path, _WHAT)
     if robot.tag != "robot":
         raise InputError(f"{path}: its root is <{robot.tag[:40]}>, not <robot>; give {_WHAT}.")
-    if "ros.org/wiki/xacro" in text:
+    if _wants_xacro(robot):
         raise InputError(f"{path}: is a xacro file; expand it first: xacro {path.name} > rig.urdf.")
     links: dict[str, Link] = {}
     for joint in robot.findall("joint"):
@@ -69,6 +72,13 @@ def read(path: Path) -> Rig:
 def recognises(path: Path, head: bytes) -> bool:
     """Whether a file begins as a URDF does."""
     return b"<robot" in head and head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+
+
+def _wants_xacro(robot: ElementTree.Element) -> bool:
+    """Whether macros stand in for joints or their numbers."""
+    joints = (element for joint in robot.findall("joint") for element in joint.iter())
+    computed = any("${" in value for element in joints for value in element.attrib.values())
+    return computed or any(_XACRO.match(element.tag) for element in robot.iter() if isinstance(element.tag, str))
 
 
 def _joint(parent: str, frame: str, T_parent_frame: Pose) -> ElementTree.Element:

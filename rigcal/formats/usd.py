@@ -60,7 +60,7 @@ def write(rig: Rig, out: Path, options: ExportOptions) -> None:
         poses = rig.T_world_cam
         logger.warning(
             "the calibration does not say which way is up, so {} does not either, and programs will take its y axis "
-            "for up; calibrate with --auto-align",
+            "for up; a calibration made with --auto-align says it",
             out,
         )
     else:
@@ -171,7 +171,7 @@ def _layer(path: Path) -> Prim:
 def _cameras(prim: Prim, T_stage_parent: Pose, where: str) -> Iterator[tuple[Prim, Array]]:
     """Every camera below a prim, with the (4, 4) matrix from its axes to the stage's."""
     for child in prim.children:
-        if child.kind == "class":
+        if child.kind == "class" or str(child.metadata.get("active")) in ("false", "0.0"):  # with all below it
             continue
         inside = f"{where}: {child.name}"
         T_parent_child = _local(child, inside)
@@ -198,10 +198,15 @@ def _local(prim: Prim, where: str) -> Array | None:
     order = prim.attributes.get("xformOpOrder", [])
     if not order:
         return np.eye(4)
-    value = prim.attributes.get("xformOp:transform")
+    value = None if _driven(prim, "xformOp:transform") else prim.attributes.get("xformOp:transform")
     if order != ["xformOp:transform"] or not isinstance(value, tuple) or len(value) != 4:
         return None
     return np.array([numbers(row, f"{where}: xformOp:transform", 4) for row in value]).T
+
+
+def _driven(prim: Prim, key: str) -> str:
+    """What else than its default value says what an attribute is: time samples, a connection; empty: nothing."""
+    return next((name for name in prim.attributes if name.startswith(f"{key}.")), "")
 
 
 def _unscaled(T: Array) -> Array:
@@ -241,6 +246,8 @@ def _film(prim: Prim, where: str) -> Film:
     """The lens that USD shows; what is not written has USD's fallback."""
 
     def told(key: str, fallback: float) -> float:
+        if driven := _driven(prim, key):
+            raise InputError(f"{where}: its lens is given by {driven}; bake it to one number at one moment first.")
         return number(prim.attributes.get(key, fallback), f"{where}: {key}")
 
     film = Film(

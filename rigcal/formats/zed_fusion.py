@@ -25,7 +25,7 @@ from aruco.atomic import write_whole
 from aruco.errors import InputError
 from aruco.pose_math import Pose, matrix_to_rvec_tvec, pose_text, rvec_tvec_to_matrix
 from rigcal.formats.json_edit import Edit, Span, before, edited, members
-from rigcal.formats.native import json_bytes
+from rigcal.formats.native import MAX_FILE_BYTES, json_bytes
 from rigcal.formats.reading import number, numbers, read_text
 from rigcal.formats.rig import HALF_TURN_X, ExportOptions, Format, Rig, listed, y_up
 from rigcal.formats.rotations import rigid_pose, steady, words
@@ -120,24 +120,25 @@ def _pose_text(T_disk: Pose) -> str:
 
 
 def _parsed(path: Path) -> tuple[str, dict[str, Any]]:
-    """A configuration's text, and its cameras, each of which has one of LAYOUTS."""
-    text = read_text(path, _WHAT)
+    """A configuration's text, and its cameras, each of which has one of LAYOUTS; remarks beside them are ignored."""
+    text = read_text(path, _WHAT, MAX_FILE_BYTES)
     try:
         content = json.loads(text)
         names = [name for name, _ in members(text)]
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as JSON ({str(error)[:200]}); give {_WHAT}.") from error
-    if not names:
+    cameras = {key: entry for key, entry in content.items() if _SERIAL.fullmatch(key) or _layout(entry)}
+    if not cameras:
         raise InputError(f"{path}: holds no camera; give {_WHAT}.")
-    if twins := listed(name for name, count in Counter(names).items() if count > 1):
+    if twins := listed(name for name, count in Counter(names).items() if count > 1 and name in cameras):
         raise InputError(f"{path}: camera {twins} is there twice; remove one of them.")
-    for serial, camera in content.items():
+    for serial, camera in cameras.items():
         if not _SERIAL.fullmatch(serial) or _layout(camera) is None:
             raise InputError(
                 f"{path}: {serial[:80]!r} is not a camera of {_WHAT}, which is a serial number with a "
                 "FusionConfiguration (SDK 5) or a world (SDK 4); remove it or give another file."
             )
-    return text, content
+    return text, cameras
 
 
 def _layout(camera: object) -> str | None:
