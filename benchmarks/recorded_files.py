@@ -1,4 +1,4 @@
-"""Recordings as other programs make them: video files, and MCAP files of JPEG images.
+"""Recordings as other programs make them: video files, MCAP files of JPEG images, SVO2 files of ZED cameras.
 
 Owns      writing such files for benchmarks.
 Leaves    reading them to what is measured.
@@ -6,7 +6,7 @@ Leaves    reading them to what is measured.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from aruco.model import Camera
 from rigcal.sources.camera_info import dump_camera_info
+from rigcal.sources.svo2_payload import FOOTER, HEAD, KEY_FRAME
 
 H264, H265 = "libx264", "libx265"
+_CONF_SECTION = {720: "HD", 1080: "FHD"}  # by the height of the images [px]
 _PARAMETERS = {H264: "x264-params", H265: "x265-params"}
 Image = NDArray[np.uint8]
 
@@ -61,6 +63,8 @@ def write_video(
                 stream.pix_fmt = pixels
                 stream.codec_context.time_base = base
                 keys = f"keyint={key_every}:min-keyint={key_every}:scenecut=0:open-gop=0:log-level=none"
+                # PyAV asks for slices, other programs do not.
+                keys += ":sliced-threads=0" if codec == H264 else ""
                 stream.options = {_PARAMETERS[codec]: keys, "crf": str(crf), "preset": "veryfast"}
             frame = av.VideoFrame.from_ndarray(image, "bgr24").reformat(format=pixels)
             frame.pts = k if stamps_ms is None else stamps_ms[k]
@@ -91,6 +95,52 @@ def write_repeated(path: Path, source: Path, times: int) -> int:
                 packet.is_keyframe = key
                 out.mux(packet)
     return times * len(packets)
+
+
+def write_svo2(folder: Path, serial: str, images: Sequence[Image], *, codec: str, times: int) -> Path:
+    """An SVO2 file of pairs (h, 2 w, 3) again and again, and the camera's factory calibration beside it."""
+    from mcap.writer import CompressionType, Writer
+
+    path, topic = folder / f"{serial}.svo2", f"Camera_SN{serial}/side_by_side"
+    height, width = images[0].shape[:2]
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start(library="libmcap stereolabs")
+        schema = writer.register_schema(topic, "zed_sdk_encoded", b"")
+        channel = writer.register_channel(topic, "zed_sdk_encoded", schema)
+        packets = list(_hardware_encoded(images, codec)) * times
+        for k, data in enumerate(packets):
+            number_of_key = k - k % len(images)
+            kind = KEY_FRAME if k == number_of_key else 0
+            stamp = 10**18 + k * 33_333_333
+            footer = FOOTER.pack(width, height, 0, 0, 0, 0, stamp, len(data), kind, number_of_key, k, 0)
+            message = HEAD.pack(len(data) + len(footer) + 4, len(data)) + data + footer
+            writer.add_message(channel, stamp, message, stamp, k)
+        writer.finish()
+    focal, centre = 0.55 * width / 2, (width / 4, height / 2)
+    lens = f"fx={focal}\nfy={focal}\ncx={centre[0]}\ncy={centre[1]}\nk1=-0.17\nk2=0.03\np1=0\np2=0\nk3=0\n"
+    eyes = "".join(f"[{side}_CAM_{_CONF_SECTION[height]}]\n{lens}" for side in ("LEFT", "RIGHT"))
+    angles = "".join(f"{angle}_{_CONF_SECTION[height]}=0.002\n" for angle in ("RX", "CV", "RZ"))
+    (folder / f"SN{serial}.conf").write_text(f"{eyes}[STEREO]\nBaseline=120\nTY=0\nTZ=0\n{angles}", encoding="utf-8")
+    return path
+
+
+def _hardware_encoded(images: Sequence[Image], codec: str) -> Iterator[bytes]:
+    """Packets as graphics cards encode a camera: no B pictures, and nothing in a picture that could be done at once."""
+    import av
+
+    context = av.CodecContext.create(codec, "w")
+    assert isinstance(context, av.VideoCodecContext)
+    context.height, context.width = images[0].shape[:2]
+    context.pix_fmt, context.time_base, context.framerate = "yuv420p", Fraction(1, 30), Fraction(30)
+    settings = "keyint=infinite:scenecut=0:bframes=0:repeat-headers=1:log-level=none"
+    settings += ":sliced-threads=0" if codec == H264 else ":wpp=0"
+    context.options = {"preset": "ultrafast", "crf": "20", "tune": "zerolatency", _PARAMETERS[codec]: settings}
+    for k, image in enumerate(images):
+        frame = av.VideoFrame.from_ndarray(image, "bgr24").reformat(format="yuv420p")
+        frame.pts = k
+        yield from map(bytes, context.encode(frame))
+    yield from map(bytes, context.encode())
 
 
 def write_intrinsics(path: Path, name: str, size: tuple[int, int]) -> Camera:

@@ -77,6 +77,14 @@ def T_right_left() -> np.ndarray:
     return T
 
 
+def R_rect_left() -> np.ndarray:
+    """(3, 3) from the axes of ``conf_text``'s left eye into those of the rectified pair."""
+    left, right = eyes()
+    T = T_right_left()
+    given = (left.K, left.distortion, right.K, right.distortion, SIZE, T[:3, :3], T[:3, 3:])
+    return np.asarray(cv2.stereoRectify(*given, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)[0])
+
+
 def write_svo2(
     path: Path,
     clips: Mapping[str, Clip],
@@ -137,7 +145,9 @@ def encoded(clip: Clip) -> list[bytes]:
     assert isinstance(context, av.VideoCodecContext)
     context.height, context.width = clip.pairs[0].shape[:2]
     context.pix_fmt, context.time_base, context.framerate = "yuv420p", Fraction(1, 30), Fraction(30)
-    params = f"keyint={clip.key_every}:min-keyint={clip.key_every}:scenecut=0:bframes=0:repeat-headers=1"
+    params = (
+        f"keyint={clip.key_every}:min-keyint={clip.key_every}:scenecut=0:bframes=0:repeat-headers=1:sliced-threads=0"
+    )
     options = {"preset": "ultrafast", "crf": "8", "tune": "zerolatency"}
     quiet = ":log-level=none" if clip.codec == "hevc" else ""
     context.options = {**options, f"{name[3:]}-params": params + quiet}

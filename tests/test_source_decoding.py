@@ -272,3 +272,23 @@ def test_mpeg4_pictures_all_come_and_are_the_same_each_time(tmp_path: Path, name
     reads = [[picture for _, picture in stream.decoder().decoded(stream.encoded(), range(40))] for _ in range(2)]
     assert not [picture for read in reads for picture in read if isinstance(picture, Undecoded)]
     np.testing.assert_array_equal(np.array(reads[0]), np.array(reads[1]))
+
+
+def test_damage_is_told_in_pictures_of_several_slices_too(tmp_path: Path) -> None:
+    """With threads for the slices libav says nothing of what goes wrong in them."""
+    images = moving_images(12, (320, 240))
+    noise = np.random.default_rng(0).integers(-30, 31, images[0].shape)
+    noisy = [np.clip(image + noise, 0, 255).astype(np.uint8) for image in images]
+    write_video(tmp_path / "v.mkv", noisy, options={"x264-params": "slices=4:keyint=12:bframes=0"}, key_every=12)
+    stream = Stream(tmp_path / "v.mkv")
+    whole = dict(stream.decoder().decoded(stream.encoded(), stream.in_order))
+    packets = stream.encoded()
+    rng, spoilt = np.random.default_rng(1), bytearray(stream.data[2])
+    for at in rng.integers(len(spoilt) // 4, len(spoilt), 40):
+        spoilt[at] ^= 1 << int(rng.integers(8))
+    packets[2] = Encoded(data=bytes(spoilt))
+    found = dict(stream.decoder().decoded(packets, stream.in_order))
+    for packet, picture in found.items():
+        assert isinstance(picture, Undecoded) == (packet >= 2)
+        if not isinstance(picture, Undecoded):
+            np.testing.assert_array_equal(picture, whole[packet])

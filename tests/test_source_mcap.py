@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ from mcap.writer import Writer as McapWriter
 
 from aruco.errors import InputError, MissingExtraError
 from aruco.model import BadFrame, Frame
-from rigcal.sources import open_recordings
-from rigcal.sources.chunked_file import Chunk, ChunkedFile
+from rigcal.sources import message_places, open_recordings
+from rigcal.sources.chunked_file import ChunkedFile
 from rigcal.sources.mcap_index import DamagedError, McapIndex
+from rigcal.sources.message_places import Chunk
 
 COMPRESSIONS = ["NONE", "LZ4", "ZSTD"]
 SIZE_BYTES = 3000
@@ -108,6 +110,9 @@ def test_parts_come_in_the_files_order_and_from_either_end(tmp_path: Path):
             assert [part.data for part in parts] == [payload(k)[wanted] for k in range(N)]
             assert {part.total for part in parts} == {SIZE_BYTES}
         assert [part.data for part in index.parts(ids, 5, start=SIZE_BYTES)] == [b""] * N
+        some = list(index.parts(ids, 5, step=7))
+        assert [part.index for part in some] == [k for k in range(0, N // 2, 7) for _ in ids]
+        assert [part.data for part in some] == [payload(2 * k + i)[:5] for k in range(0, N // 2, 7) for i in (0, 1)]
 
 
 def test_a_damaged_chunk_costs_its_own_messages_only(tmp_path: Path, said: list[str]):
@@ -131,14 +136,106 @@ def chunk_at(data: bytes | bytearray) -> int:
     return at
 
 
-@pytest.mark.parametrize(("field", "value"), [(16, 2**40), (16, 2**30 + 1)])
-def test_absurd_sizes_are_refused(field: int, value: int, tmp_path: Path):
+def records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
+    """(opcode, where it begins, where its contents begin) of each record."""
+    at = 8
+    while at < len(data) - 8:
+        yield data[at], at, at + 9
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+
+
+def middle(data: bytes | bytearray, opcode: int) -> int:
+    """Where the contents of the middle one of some records begin."""
+    found = [body for kind, _, body in records(data) if kind == opcode]
+    return found[len(found) // 2]
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+@pytest.mark.parametrize(
+    ("field", "value", "what"),
+    [
+        (16, struct.pack("<Q", 2**40), "states 1099511627776 bytes, more than 1 GiB"),
+        (16, struct.pack("<Q", 2**30 + 1), "states 1073741825 bytes, more than 1 GiB"),
+        (28, struct.pack("<I", 2**31), "has a damaged header"),  # length of the compression's name
+        (28, struct.pack("<I", 65), "has a damaged header"),
+    ],
+)
+def test_a_damaged_head_of_a_chunk_costs_its_own_messages_only(
+    field: int, value: bytes, what: str, indexed: bool, tmp_path: Path, said: list[str]
+):
+    path = plain(tmp_path / "a.mcap", index_types=IndexType.ALL if indexed else IndexType.NONE)
+    data = bytearray(path.read_bytes())
+    at = middle(data, 6) + field
+    data[at : at + len(value)] = value
+    path.write_bytes(data)
+    tracemalloc.start()
+    index = McapIndex(path)
+    found = read(index)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert N - 4 <= len(found) < N
+    assert all(found[k] == payload(k) for k in found)
+    if indexed:  # when the lost ones were taken is known all the same
+        assert [index.count(channel.id) for channel in index.channels] == [N // 2, N // 2]
+    assert len(said) == 1
+    assert f"{what}; its messages are lost" in said[0]
+    assert peak < 20 * 2**20  # nowhere near what the chunk states
+
+
+def test_a_damaged_index_costs_nothing(tmp_path: Path, said: list[str]):
+    """One entry has half its bytes: the chunk is looked into, as one without an index."""
     path = plain(tmp_path / "a.mcap")
     data = bytearray(path.read_bytes())
-    struct.pack_into("<Q", data, chunk_at(data) + 9 + field, value)
+    at = middle(data, 7)
+    length = struct.unpack_from("<Q", data, at - 8)[0]
+    struct.pack_into("<Q", data, at - 8, length - 8)
+    del data[at + length - 8 : at + length]
     path.write_bytes(data)
-    with pytest.raises(InputError, match="more than 1 GiB"):
-        McapIndex(path)
+    index = McapIndex(path)
+    assert read(index) == {k: payload(k) for k in range(N)}
+    assert [index.count(channel.id) for channel in index.channels] == [N // 2, N // 2]
+    assert said == []
+
+
+def test_a_damaged_definition_is_left_out_and_told(tmp_path: Path, said: list[str]):
+    """Those of a chunk are whole, and used."""
+    path = plain(tmp_path / "a.mcap")
+    data = bytearray(path.read_bytes())
+    for kind, _, body in records(data):
+        if kind == 4:
+            struct.pack_into("<I", data, body + 4, 2**31)  # length of the topic
+    path.write_bytes(data)
+    assert read(McapIndex(path)) == {k: payload(k) for k in range(N)}
+    assert len(said) == 1
+    assert "damaged records left out: 2; first the one at byte" in said[0]
+
+
+def bare(path: Path, n: int) -> Path:
+    """A file of n small messages in no chunk."""
+    data = plain(path, use_chunking=False).read_bytes()
+    first = next(at for kind, at, _ in records(data) if kind == 5)
+    messages = b"".join(struct.pack("<BQHIQQ", 5, 22 + 8, 1, k, k, 0) + b"12345678" for k in range(n))
+    path.write_bytes(data[:first] + messages + data[first:])
+    return path
+
+
+def test_a_message_in_no_chunk_costs_as_little_as_one_in_a_chunk(tmp_path: Path):
+    path, n = bare(tmp_path / "a.mcap", 20_000), 20_000
+    McapIndex(path)  # imports
+    tracemalloc.start()
+    index = McapIndex(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert index.count(1) == n + N // 2
+    # 20 bytes as they come, 20 sorted, 8 for their order, and what arrays keep in reserve; as tuples they took 200.
+    assert peak < 70 * n
+
+
+def test_too_many_messages_are_refused_as_soon_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(message_places, "MAX_MESSAGES", 50)
+    for path in (bare(tmp_path / "bare.mcap", 51), plain(tmp_path / "a.mcap")):
+        with pytest.raises(InputError, match="has more than 50 messages; give a part of the recording"):
+            McapIndex(path)
 
 
 def test_a_chunk_that_yields_more_or_less_than_it_states_is_lost(tmp_path: Path, said: list[str]):

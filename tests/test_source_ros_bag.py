@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 
 from aruco.errors import InputError
 from aruco.model import BadFrame, Frame, Recording
-from rigcal.sources import open_recordings
+from rigcal.sources import open_recordings, sqlite_file
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.ros_bag import BagStore, recognises
 from rigcal.sources.rosbag1_index import Rosbag1Index
@@ -154,18 +156,31 @@ def test_a_bag_without_index_is_read_like_any_other(tmp_path: Path):
     np.testing.assert_array_equal([frame.image for frame in good(open_recordings([active]))], IMAGES)
 
 
-def test_chunks_without_message_index_are_looked_into(tmp_path: Path):
-    whole = write_bag1(tmp_path / "rig.bag", rig(Ros(1)))
-    data, out, at = whole.read_bytes(), bytearray(b"#ROSBAG V2.0\n"), len(b"#ROSBAG V2.0\n")
+def without_index(data: bytes) -> bytearray:
+    out, at = bytearray(b"#ROSBAG V2.0\n"), len(b"#ROSBAG V2.0\n")
     while at < len(data):
         head = struct.unpack_from("<I", data, at)[0]
         end = at + 8 + head + struct.unpack_from("<I", data, at + 4 + head)[0]
         if b"op=\x04" not in data[at + 4 : at + 4 + head]:
             out += data[at:end]
         at = end
-    bare = tmp_path / "bare.bag"
-    bare.write_bytes(out)
-    np.testing.assert_array_equal([frame.image for frame in good(open_recordings([bare]))], IMAGES)
+    return out
+
+
+def test_chunks_without_message_index_are_looked_into(tmp_path: Path, said: list[str]):
+    bag = write_bag1(tmp_path / "rig.bag", rig(Ros(1)))
+    data = without_index(bag.read_bytes())
+    bag.write_bytes(data)
+    np.testing.assert_array_equal([frame.image for frame in good(open_recordings([bag]))], IMAGES)
+    assert said == []
+    at = data.index(b"time=", data.index(b"op=\x02"))
+    data[at] ^= 1
+    bag.write_bytes(data)
+    found = good(open_recordings([bag]))
+    assert len(found) in (N - 1, N)  # an image, or a CameraInfo
+    assert len(said) == 1
+    assert "damaged records left out: 1; first one in the chunk at byte" in said[0]
+    assert said[0].endswith("which lacks its time")
 
 
 def test_a_damaged_chunk_costs_its_own_messages_only(tmp_path: Path, said: list[str]):
@@ -182,19 +197,59 @@ def test_a_damaged_chunk_costs_its_own_messages_only(tmp_path: Path, said: list[
     assert any("cannot be decompressed" in line and "its messages are lost" in line for line in said)
 
 
-def test_absurd_sizes_are_refused_before_memory_is_taken(tmp_path: Path):
-    whole = write_bag1(tmp_path / "rig.bag", rig(Ros(1)))
+def middle(data: bytes | bytearray, op: bytes) -> int:
+    """Where the kind stands in the header of the middle one of some records."""
+    places = [k for k in range(len(data)) if data.startswith(b"op=" + op, k)]
+    return places[len(places) // 2]
+
+
+@pytest.mark.parametrize("compression", ["", "lz4"])
+def test_a_chunk_of_absurd_size_costs_its_own_messages_only(compression: str, tmp_path: Path, said: list[str]):
+    whole = write_bag1(tmp_path / "rig.bag", rig(Ros(1)), compression=compression)
     data = bytearray(whole.read_bytes())
-    at = data.index(b"op=\x05")
+    at = middle(data, b"\x05")
     at = data.index(b"size=", at - 60) + len(b"size=")
     data[at : at + 4] = struct.pack("<I", 2**31)
     whole.write_bytes(data)
     tracemalloc.start()
-    text = complaint(whole)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert "more than 1 GiB" in text
+    try:
+        found = [frame for frame in frames(open_recordings([whole])) if isinstance(frame, Frame)]
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert N - 3 <= len(found) < N
+    for frame in found:
+        np.testing.assert_array_equal(frame.image, IMAGES[(frame.stamp_ns - T0) // PERIOD])
+    assert any("states 2147483648 bytes, more than 1 GiB; its messages are lost" in line for line in said)
     assert peak < 50 * 2**20  # nowhere near what the chunk states
+
+
+@pytest.mark.parametrize("field", [b"count=", b"conn="])
+def test_a_damaged_index_costs_nothing(field: bytes, tmp_path: Path, said: list[str]):
+    whole = write_bag1(tmp_path / "rig.bag", rig(Ros(1)))
+    data = bytearray(whole.read_bytes())
+    at = middle(data, b"\x04")
+    header = slice(at - 60, at + 60)
+    at = at - 60 + data[header].index(field)
+    data[at if field == b"conn=" else at + len(field)] ^= 1  # another name, another number
+    whole.write_bytes(data)
+    np.testing.assert_array_equal([frame.image for frame in good(open_recordings([whole]))], IMAGES)
+    assert said == []
+
+
+def test_a_record_of_no_known_kind_is_left_out_and_told(tmp_path: Path, said: list[str]):
+    """The index of a chunk that is not known for one is not taken for that of the chunk before."""
+    whole = write_bag1(tmp_path / "rig.bag", rig(Ros(1)))
+    data = bytearray(whole.read_bytes())
+    data[middle(data, b"\x05") + 3] = 0
+    whole.write_bytes(data)
+    found = good(open_recordings([whole]))
+    assert N - 3 <= len(found) < N
+    for frame in found:
+        np.testing.assert_array_equal(frame.image, IMAGES[(frame.stamp_ns - T0) // PERIOD])
+    assert len(said) == 1
+    assert "damaged records left out: 1; first the one at byte" in said[0]
+    assert said[0].endswith("which is of no known kind")
 
 
 def test_a_chunk_that_yields_more_than_it_states_is_lost(tmp_path: Path, said: list[str]):
@@ -218,7 +273,7 @@ def test_old_encrypted_and_other_files_are_named(tmp_path: Path):
     head = struct.unpack_from("<I", data, 13)[0]
     secret = tmp_path / "secret.bag"
     secret.write_bytes(data[:13] + struct.pack("<I", head + len(field)) + data[17:at] + field + data[at:])
-    assert "is encrypted (rosbag/AesCbc)" in complaint(secret)
+    assert "is encrypted (rosbag/AesCbc); decrypt it" in complaint(secret)
     empty = tmp_path / "empty.bag"
     empty.write_bytes(b"#ROSBAG V2.0\n")
     assert "holds no images that are read; its topics: none" in complaint(empty)
@@ -272,6 +327,51 @@ def test_of_a_db3_file_that_is_cut_off_what_is_found_is_used(tmp_path: Path, sai
         if isinstance(frame, Frame):
             np.testing.assert_array_equal(frame.image, IMAGES[(frame.stamp_ns - T0) // PERIOD])
     assert any("damaged or cut off" in line or "messages are damaged" in line for line in said)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def test_reading_a_db3_file_leaves_its_folder_as_it_is(tmp_path: Path):
+    """SQLite makes files beside one that keeps a log, even where it only reads."""
+    folder = write("sqlite3", tmp_path, rig)
+    with closing(sqlite3.connect(folder / "rig.db3")) as base:
+        base.execute("PRAGMA journal_mode=WAL")
+    before = contents(folder)
+    assert sorted(before) == ["metadata.yaml", "rig.db3"]
+    np.testing.assert_array_equal([frame.image for frame in good(open_recordings([folder]))], IMAGES)
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("with_index", [True, False])
+def test_what_a_killed_recorder_left_in_a_log_is_read(with_index: bool, tmp_path: Path):
+    folder = write("sqlite3", tmp_path, rig)
+    killed = tmp_path / "killed"
+    with closing(sqlite3.connect(folder / "rig.db3")) as base:
+        base.execute("PRAGMA journal_mode=WAL")
+        base.execute("UPDATE messages SET data = (SELECT data FROM messages WHERE id = 2) WHERE id = 6")
+        base.commit()
+        shutil.copytree(folder, killed)
+    if not with_index:
+        (killed / "rig.db3-shm").unlink()
+    before = contents(killed)
+    assert len(before["rig.db3-wal"]) > 0
+    found = good(open_recordings([killed]))
+    # The second image is the first again, which only the log says.
+    np.testing.assert_array_equal([frame.image for frame in found], [IMAGES[0], *IMAGES[2:]])
+    assert contents(killed) == before
+    (killed / "rig.db3-wal").unlink()
+    np.testing.assert_array_equal([frame.image for frame in good(open_recordings([killed]))], IMAGES)
+
+
+def test_a_log_that_cannot_be_read_is_told(tmp_path: Path, said: list[str], monkeypatch: pytest.MonkeyPatch):
+    """As in a folder that nobody may write to, where SQLite cannot make the index that the log needs."""
+    folder = write("sqlite3", tmp_path, rig)
+    (folder / "rig.db3-wal").write_bytes(b"x")
+    monkeypatch.setattr(sqlite_file.SqliteFile, "_works", lambda self, way: not way.reads_log)
+    assert len(good(open_recordings([folder]))) == N
+    assert [line for line in said if "what was recorded last lies in rig.db3-wal and cannot be read" in line]
 
 
 def test_a_db3_file_without_tables_or_with_absurd_ones_is_named(tmp_path: Path):

@@ -14,7 +14,8 @@ from aruco.model import BadFrame, Camera, Frame
 from rigcal.sources import open_recordings
 from rigcal.sources.message_store import Topic, plain_type
 from rigcal.sources.options import SourceOptions
-from rigcal.sources.ros_topics import CameraTopics, First, paired
+from rigcal.sources.ros_streams import First
+from rigcal.sources.ros_topics import CameraTopics, paired
 
 IMAGE, COMPRESSED, INFO = "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo"
 
@@ -203,19 +204,122 @@ def test_a_topic_that_is_not_there_is_listed_against_what_is():
     assert "/zed/zed_node/left/image_rect_color (sensor_msgs/Image, 5)" in text
 
 
-def test_two_cameras_of_one_name_are_refused():
-    rows = [
-        (f"/{ns}/{t}", e, "f") for ns in ("a_b", "a/b") for t, e in (("image_raw", "bgr8"), ("camera_info", "info"))
-    ]
-    with pytest.raises(
-        InputError, match="camera a_b is both /a/b/image_raw and /a_b/image_raw; name them with --topics"
-    ):
-        cameras(rows)
-
-
 def test_types_have_one_name_in_ros_1_and_2_and_dds():
     for name in ("sensor_msgs/Image", "sensor_msgs/msg/Image", "sensor_msgs::msg::dds_::Image_"):
         assert plain_type(name) == "sensor_msgs/Image"
+
+
+def rows_of(topics: dict[str, str], frame: str) -> list[tuple[str, str, str]]:
+    return [(topic, encoding, frame) for topic, encoding in topics.items()]
+
+
+@pytest.mark.parametrize("above", ["", "/rig"])
+def test_namespaces_may_be_called_like_streams(above: str):
+    """Two RealSenses under /left and /right, also where they stand below another namespace."""
+    rows = [
+        (row[0].replace("/camera/camera", f"{above}/{side}"), row[1], f"{side}_{row[2]}")
+        for side in ("left", "right")
+        for row in REALSENSE
+    ]
+    found = cameras(rows)
+    prefix = above.strip("/") + "_" if above else ""
+    assert sorted(found) == [f"{prefix}left", f"{prefix}right"]
+    for side in ("left", "right"):
+        camera = found[f"{prefix}{side}"]
+        assert camera.image == f"{above}/{side}/color/image_raw"
+        assert camera.depth == f"{above}/{side}/aligned_depth_to_color/image_raw"
+
+
+def test_plain_cameras_called_left_and_right_have_their_own_depth():
+    rows = []
+    for side in ("left", "right"):
+        rows += plain(side)
+        rows += rows_of({f"/{side}/depth/image_raw": "16UC1", f"/{side}/depth/camera_info": "info"}, side)
+    found = cameras(rows)
+    assert {name: (c.image, c.depth) for name, c in found.items()} == {
+        side: (f"/{side}/image_raw", f"/{side}/depth/image_raw") for side in ("left", "right")
+    }
+
+
+def test_the_newest_zed_drivers_left_images_are_no_namespace():
+    rows = [
+        ("/zed/zed_node/left/color/rect/image", "bgra8", "left"),
+        ("/zed/zed_node/left/color/rect/camera_info", "info", "left"),
+        ("/zed/zed_node/left/gray/rect/image", "mono8", "left"),
+        ("/zed/zed_node/left/gray/rect/camera_info", "info", "left"),
+        ("/zed/zed_node/right/color/rect/image", "bgra8", "right"),
+        ("/zed/zed_node/right/color/rect/camera_info", "eye", "right"),
+        ("/zed/zed_node/depth/depth_registered", "32FC1", "left"),
+    ]
+    camera = cameras(rows)["zed"]
+    assert camera.image == "/zed/zed_node/left/color/rect/image"
+    assert camera.depth == "/zed/zed_node/depth/depth_registered"
+    assert camera.right_info == "/zed/zed_node/right/color/rect/camera_info"
+
+
+@pytest.mark.parametrize(
+    "namespaces", [("color", "left", "right"), ("oak/rgb", "oak/left", "oak/right"), ("rgb/north", "rgb/south")]
+)
+def test_images_of_frames_and_camera_infos_of_their_own_are_cameras(namespaces: tuple[str, ...]):
+    found = cameras(plain(*namespaces))
+    assert {name: camera.image for name, camera in found.items()} == {
+        namespace.replace("/", "_"): f"/{namespace}/image_raw" for namespace in namespaces
+    }
+
+
+def test_colour_beside_two_eyes_is_one_camera():
+    rows = [*plain("oak/rgb", "oak/left"), ("/oak/right/image_raw", "bgr8", "right")]
+    assert list(cameras([*rows, ("/oak/right/camera_info", "info", "right")])) == ["oak_left", "oak_rgb", "oak_right"]
+    found = cameras([*rows, ("/oak/right/camera_info", "eye", "right")])
+    assert "oak_right" not in found
+
+
+def test_what_may_be_a_camera_of_its_own_is_not_left_out_in_silence(said: list[str]):
+    assert list(cameras(plain("rgb", "ir"))) == ["camera"]
+    assert said == [
+        "/ir/image_raw are taken for other images of the camera of /rgb/image_raw and left out; where they are cameras "
+        "name all with --topics NAME=IMAGE_TOPIC"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/front_rect/image_raw", False),
+        ("/rig/front_rect/image", False),
+        ("/rect/color/image_raw", False),
+        ("/cam/image_rect_color", True),
+        ("/cam/left/image_rect", True),
+        ("/cam/left_rect/image", True),
+        ("/cam/infra1/image_rect_raw", True),
+        ("/zed/zed_node/rgb/color/rect/image", True),
+        ("/cam/left_rect/image_raw", False),
+    ],
+)
+def test_only_a_streams_own_name_says_that_it_is_rectified(topic: str, rectified: bool):
+    (camera,) = cameras([(topic, "bgr8", "f")]).values()
+    assert camera.is_rectified == rectified
+
+
+ALIGNED = {
+    "/camera/color/image_raw": "rgb8",
+    "/camera/color/camera_info": "info",
+    "/camera/aligned_depth_to_color/image_raw": "16UC1",
+    "/camera/aligned_depth_to_color/camera_info": "info",
+}
+
+
+@pytest.mark.parametrize(
+    ("topic", "frame"), [("/camera/confidence/image_rect_raw", "f"), ("/camera/confidence/confidence_map", "other")]
+)
+def test_confidence_that_is_not_the_zeds_of_this_depth_is_left_out(topic: str, frame: str, said: list[str]):
+    camera = cameras([*rows_of(ALIGNED, "f"), (topic, "mono8", frame)])["camera"]
+    assert camera.depth == "/camera/aligned_depth_to_color/image_raw"
+    assert camera.confidence is None
+    assert said == [
+        f"camera camera: confidence {topic} is left out: only the ZED driver's is known (confidence_map, of depth's "
+        "frame and size)"
+    ]
 
 
 # From here on with files, because intrinsics are in messages.
@@ -308,18 +412,46 @@ def test_the_baseline_is_in_the_right_eyes_projection(tmp_path: Path):
     assert opened(tmp_path, messages)["zed"].baseline_m == pytest.approx(0.12)
 
 
+def test_two_cameras_of_one_name_are_refused(tmp_path: Path):
+    ros = Ros(2)
+    messages = [m for ns in ("a_b", "a/b") for m in (*images(ros, f"/{ns}/image_raw"), ros.info(f"/{ns}/camera_info"))]
+    with pytest.raises(
+        InputError, match="camera a_b is both /a/b/image_raw and /a_b/image_raw; name them with --topics"
+    ):
+        opened(tmp_path, messages)
+
+
+def test_a_camera_called_like_a_rectified_stream_keeps_its_distortion(tmp_path: Path):
+    ros, d = Ros(2), [-0.3, 0.1, 0.0, 0.0, 0.0]
+    messages = [*images(ros, "/front_rect/image_raw"), ros.info("/front_rect/camera_info", d=d, p=P)]
+    camera = opened(tmp_path, messages)["front_rect"]
+    np.testing.assert_array_equal(camera.K, K)
+    np.testing.assert_array_equal(camera.distortion, d)
+
+
+def test_confidence_of_other_programs_spoils_no_depth(tmp_path: Path):
+    """As an L515's, which has a size and a meaning of its own."""
+    ros = Ros(2)
+    depth = np.full((SIZE[1], SIZE[0]), 1000, dtype=np.uint16)
+    messages = [*images(ros, "/camera/color/image_raw"), ros.info("/camera/color/camera_info")]
+    messages += [ros.image("/camera/aligned_depth_to_color/image_raw", 10**9 * k, depth, "16UC1") for k in (1, 2)]
+    messages += [ros.info("/camera/aligned_depth_to_color/camera_info")]
+    messages += [
+        ros.image("/camera/confidence/image_rect_raw", 10**9 * k, IMAGES[0][:24, :32, 0], "mono8") for k in (1, 2)
+    ]
+    recording = open_recordings([write_mcap(tmp_path / PATH, messages)])
+    for frame in recording.frames("camera", range(2), depth=True):
+        assert isinstance(frame, Frame), frame
+        assert frame.depth_m is not None
+        assert frame.confidence is None
+
+
 def test_without_camera_info_the_remedies_are_named(tmp_path: Path):
     with pytest.raises(InputError) as caught:
         opened(tmp_path, images(Ros(2)))
     assert "no CameraInfo beside /cam/image_raw; record the camera_info topics too, name them with --topics" in str(
         caught.value
     )
-
-
-def test_intrinsics_may_come_from_a_file(tmp_path: Path):
-    known = {"cam": Camera(name="cam", width=SIZE[0], height=SIZE[1], K=K)}
-    found = opened(tmp_path, images(Ros(2)), intrinsics=tmp_path / "rig.yaml", read_cameras=lambda path: known)
-    np.testing.assert_array_equal(found["cam"].K, K)
 
 
 def test_a_camera_without_camera_info_is_left_out_beside_others(tmp_path: Path, told: list[str]):
@@ -352,7 +484,7 @@ def test_an_image_of_another_size_is_a_bad_frame(tmp_path: Path):
     found = list(open_recordings([path]).frames("cam", range(3)))
     assert [isinstance(frame, Frame) for frame in found] == [True, True, False]
     assert isinstance(found[2], BadFrame)
-    assert "is 64 x 10, but the CameraInfo says 64 x 48" in found[2].reason
+    assert "is 64 x 10, but the intrinsics are of 64 x 48" in found[2].reason
 
 
 def test_depth_of_a_distorted_image_is_straightened(tmp_path: Path):

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from svo2_writer import (
     SIZE,
     START_NS,
     Clip,
+    R_rect_left,
     T_right_left,
     conf_text,
     eyes,
@@ -28,6 +29,7 @@ from aruco.lens import project, undistort
 from aruco.model import BadFrame, Camera, Frame, KnowsUp
 from aruco.pose_math import exp_so3, make_pose, transform_points
 from rigcal.sources import stereo_depth, svo2_pictures, svo2_sensors, zed_conf
+from rigcal.sources.mcap_index import McapIndex, Part
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.svo2 import Svo2, opened, recognises
 from rigcal.sources.svo2_payload import coding_of, eye_size, payload_of
@@ -168,7 +170,6 @@ def test_a_board_lies_where_the_rectified_pinhole_projects_it(
     (camera,) = recording.cameras
     frame = next(recording.frames(SERIAL, [1]))
     assert isinstance(frame, Frame)
-    rectification = zed_conf.factory_calibration(tmp_path / f"SN{SERIAL}.conf", *SIZE).rectification()
     found = _found_corners(frame.image)
     assert len(found) >= 6
     raw = _found_corners(pair[:, : SIZE[0]])
@@ -177,7 +178,7 @@ def test_a_board_lies_where_the_rectified_pinhole_projects_it(
         if k not in found or k not in raw:
             continue
         # The sheet's pixel edges, not centres, are the corners of its markers; see _drawn's half pixel.
-        p_left = transform_points(T_left_board, corners) @ rectification.R_rect_left.T
+        p_left = transform_points(T_left_board, corners) @ R_rect_left().T
         expected = project(camera, p_left)
         off.append(np.linalg.norm(found[k] - expected, axis=1))
         off_right.append(np.linalg.norm(found[k] - project(camera, p_left - [camera.baseline_m, 0, 0]), axis=1))
@@ -311,6 +312,26 @@ def test_sensors_are_read_and_doubted_once(tmp_path: Path, said: list[str], monk
     assert sum("accelerometer" in line for line in said) == 1
 
 
+def test_of_many_sensor_messages_only_some_are_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A day has 35 million. Every fourth of these says another thing than the others."""
+    monkeypatch.setattr(svo2_sensors, "_MAX_SAMPLES", 100)
+    seen: list[int] = []
+    original = McapIndex.parts
+
+    def noted(self: McapIndex, *given: Any, **options: Any) -> Iterator[Part]:
+        for part in original(self, *given, **options):
+            seen.append(part.index)
+            yield part
+
+    lying = [(0.0, -9.8, 0.0) if k % 4 == 0 else (9.8, 0.0, 0.0) for k in range(400)]
+    recording = opened(_recording(tmp_path, Clip(pairs=_pairs(2), accelerations=lying)), SourceOptions())
+    monkeypatch.setattr(McapIndex, "parts", noted)
+    up = recording.up_in_camera(SERIAL)
+    assert up is not None
+    np.testing.assert_allclose(up, [0, -1, 0], atol=1e-6)  # they are written as float32
+    assert seen == list(range(0, 400, 4))
+
+
 def test_readers_with_depth_do_not_share_a_matcher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[stereo_depth.StereoMatcher] = []
 
@@ -425,6 +446,19 @@ def test_a_damaged_chunk_spoils_its_frames_only(tmp_path: Path, said: list[str])
     assert 0 < len(bad) < 10
     assert any("damaged chunk" in reason for reason in bad)
     assert any("does not fit its checksum" in line for line in said)
+
+
+def test_a_damaged_chunk_of_key_frames_does_not_cost_the_others(tmp_path: Path) -> None:
+    """The first six of them, none of which can tell how the frames are coded."""
+    clip = Clip(pairs=_pairs(12), key_every=1)
+    path = _recording(tmp_path, clip, chunk_size=sum(len(message) for message in frame_messages(clip)[:6]))
+    data = bytearray(path.read_bytes())
+    data[data.find(b"\x00\x00\x00\x01") + 60] ^= 0xFF
+    path.write_bytes(bytes(data))
+    frames = _read(path, range(12))
+    n_bad = next(k for k, frame in enumerate(frames) if isinstance(frame, Frame))
+    assert n_bad >= 6  # five were once asked
+    assert all(isinstance(frame, Frame) for frame in frames[n_bad:])
 
 
 def test_stamps_out_of_order_are_sorted_and_doubles_dropped(tmp_path: Path) -> None:

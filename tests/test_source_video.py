@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Mapping
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -545,6 +546,44 @@ def test_what_the_user_gives_comes_before_what_lies_beside(two: list[Path], tmp_
     give_intrinsics(folder / "left.mp4", (320, 240))
     with pytest.raises(InputError, match=r"folder/left\.yaml"):
         opened(two[0], SourceOptions(read_cameras=read_ros, intrinsics=folder))
+
+
+def test_a_folder_that_is_a_calibration_gives_the_intrinsics(two: list[Path], tmp_path: Path) -> None:
+    model = tmp_path / "model"
+    model.mkdir()
+    cameras = {"left": camera("left"), "right": camera("right")}
+    options = SourceOptions(read_cameras=lambda path: {model: cameras}[path], same_clock=True, intrinsics=model)
+    assert [known.name for known in opened_together(two, options).cameras] == ["left", "right"]
+    del cameras["right"]
+    with pytest.raises(
+        InputError, match=r"right\.mkv: .* in what --intrinsics gives \(.*model has left, none .* right\)"
+    ):
+        opened_together(two, options)
+
+    def refuse(path: Path) -> Mapping[str, Camera]:
+        raise InputError(f"{path}: no intrinsics there.")
+
+    with pytest.raises(InputError, match=r"model: no intrinsics there\."):
+        opened_together(two, SourceOptions(read_cameras=refuse, same_clock=True, intrinsics=model))
+
+
+def test_files_of_equal_rank_beside_a_video_are_not_chosen_among(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", moving_images(3))
+    known = {tmp_path / "camchain.yaml": {"a": camera("a")}, tmp_path / "camchain-2.yaml": {"a": camera("b")}}
+    for path in known:
+        path.touch()
+    options = SourceOptions(read_cameras=lambda path: known[path])
+    assert opened(tmp_path / "a.mp4", options).cameras[0].name == "a"  # they say the same
+    K = camera("a").K.copy()
+    K[0, 0] += 1
+    known[tmp_path / "camchain-2.yaml"] = {"a": replace(camera("a"), K=K)}
+    with pytest.raises(
+        InputError, match=r"a\.mp4: camchain-2\.yaml and camchain\.yaml .* different .*--intrinsics FILE"
+    ):
+        opened(tmp_path / "a.mp4", options)
+    # Of the one that has the camera there is no doubt.
+    known[tmp_path / "camchain-2.yaml"] = {"b": replace(camera("b"), K=K), "c": camera("c")}
+    assert opened(tmp_path / "a.mp4", options).cameras[0].K[0, 0] == K[0, 0] - 1
 
 
 def test_videos_in_both_codecs_are_read_from_a_name_with_signs(tmp_path: Path) -> None:

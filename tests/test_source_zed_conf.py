@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import SHARED_DATA
-from svo2_writer import LEFT, RIGHT, SIZE, T_right_left, conf_text, eyes
+from svo2_writer import LEFT, RIGHT, SIZE, R_rect_left, T_right_left, conf_text, eyes
 
 from aruco.errors import InputError
 from aruco.lens import project
@@ -89,7 +89,7 @@ def test_a_positive_baseline_gives_another_camera(tmp_path: Path) -> None:
     assert stereo.t_right_left[0] == pytest.approx(-0.12)
     wrong = cv2.stereoRectify(
         stereo.left.K, stereo.left.distortion, stereo.right.K, stereo.right.distortion, (1280, 720),
-        stereo.R_right_left, -stereo.t_right_left, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
+        stereo.R_right_left, -stereo.t_right_left[:, None], flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
     )  # fmt: skip
     assert wrong[3][0, 3] > 0  # a right eye on the left
 
@@ -100,7 +100,7 @@ def test_points_land_where_the_rectified_pinhole_projects_them(tmp_path: Path) -
     rectification = stereo.rectification()
     points = np.array([[0.1, -0.1, 1.0], [-0.5, 0.2, 2.0], [0.3, 0.3, 1.5], [0.0, 0.0, 0.7]])
     left, right = eyes()
-    expected = points @ rectification.R_rect_left.T
+    expected = points @ R_rect_left().T
     expected_px = expected[:, :2] / expected[:, 2:] @ rectification.K[:2, :2].T + rectification.K[:2, 2]
     seen_left = project(left, points)
     seen_right = project(right, transform_points(T_right_left(), points))

@@ -19,6 +19,7 @@ from aruco.errors import InputError
 from aruco.model import BadFrame, Frame, KnowsUp
 from aruco.pose_math import Array
 from rigcal.sources import zed_sdk
+from rigcal.sources.mcap_records import MAGIC
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.zed_player import RefusedError
 
@@ -441,8 +442,8 @@ def test_without_the_sdk_an_svo_says_how_to_install_it(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("without_sdk")
 def test_without_the_sdk_svo2_is_left_to_its_own_reader(tmp_path: Path) -> None:
     for name in ("a.svo2", "b.svo"):
-        (tmp_path / name).write_bytes(zed_sdk.MCAP_MAGIC)
-        assert not zed_sdk.recognises(tmp_path / name, zed_sdk.MCAP_MAGIC)
+        (tmp_path / name).write_bytes(MAGIC)
+        assert not zed_sdk.recognises(tmp_path / name, MAGIC)
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from benchmarks.recorded_files import (
     write_intrinsics,
     write_jpeg_mcap,
     write_repeated,
+    write_svo2,
     write_video,
 )
 from rigcal.config import CalibrateConfig
@@ -33,6 +34,7 @@ from rigcal.recordings import read_cameras
 from rigcal.sources import open_recordings
 from rigcal.sources.camera_info import dump_camera_info
 from rigcal.sources.options import SourceOptions
+from rigcal.sources.svo2_payload import FOOTER, HEAD
 from rigcal.target import board_target
 
 HD = (1920, 1080)
@@ -46,11 +48,14 @@ def run(*, quick: bool) -> list[Metric]:
     with tempfile.TemporaryDirectory() as folder:
         here = Path(folder)
         images = filmed_images(60, HD)
+        pairs = filmed_images(30, (2 * 1280, 720))
         rounds = {"times": 3, "repeats": 3} if quick else {"times": 8, "repeats": 5}
         return [
             *_video_speed(here, images, H264, **rounds),
             *_video_speed(here, images, H265, **rounds),
             *_mcap_speed(here, images, **rounds),
+            *_svo2_speed(here, pairs, H264, **rounds),
+            *_svo2_speed(here, pairs, H265, **rounds),
             *_seeking(here, times=180 if quick else 1800),
             *_memory(here, images),
             *(_webcams(here) if WEBCAMS.is_dir() else ()),
@@ -128,6 +133,26 @@ def _mcap_speed(here: Path, images: Sequence[np.ndarray], times: int, repeats: i
         "mcap.of_opencv", lambda: _read_all(path), from_memory, repeats, f"{about} OpenCV decoding bytes in memory"
     )
     return [plain, replace(strict, limit=None, rel_tol=None)]
+
+
+def _svo2_speed(here: Path, pairs: Sequence[np.ndarray], codec: str, times: int, repeats: int) -> list[Metric]:
+    """Decoded, cut into eyes and rectified, over decoding both eyes alone."""
+    import av
+    from mcap.reader import make_reader
+
+    name = {H264: "h264", H265: "hevc"}[codec]
+    path = write_svo2(here, {H264: "10000264", H265: "10000265"}[codec], pairs, codec=codec, times=2 * times)
+
+    def bare() -> int:
+        decoder = av.CodecContext.create(name, "r")
+        assert isinstance(decoder, av.VideoCodecContext)
+        with path.open("rb") as stream:
+            packets = [av.Packet(m.data[HEAD.size : -FOOTER.size]) for _, _, m in make_reader(stream).iter_messages()]
+        frames = (frame for packet in (*packets, None) for frame in decoder.decode(packet))
+        return sum(frame.to_ndarray(format="bgr24").ndim == 3 for frame in frames)
+
+    about = f"opening, reading and rectifying 720p SVO2 of {name.upper()} over mcap and PyAV decoding it to BGR"
+    return [_of_bare(f"svo2_{name}.of_decoder", lambda: _read_all(path), bare, repeats, about)]
 
 
 def _seeking(here: Path, times: int) -> list[Metric]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -79,6 +80,7 @@ def open_recordings(paths: Sequence[Path], options: SourceOptions | None = None)
 
 def _opened(found: Sequence[_Found], options: SourceOptions) -> list[tuple[Path, Recording]]:
     """Each recording with where it lies; all videos are one, because they may have one clock and one calibration."""
+    options = replace(options, is_only=len(found) == 1)
     videos = [one.path for one in found if one.kind == "video"]
     opened = [(one.path, _with_sdk_or_without(one, options)) for one in found if one.kind != "video"]
     if options.stereo_depth:
@@ -166,21 +168,21 @@ def _in_folder(path: Path) -> list[_Found]:
     if inside:
         _tell_left_out(path, inside)
         return inside
-    from rigcal.sources.rgbd_folder import is_without_images
+    from rigcal.sources import rgbd_folder
     from rigcal.sources.unknown import RECORDING_SUFFIXES, empty_folder, unknown_file
 
     for child in _considered(path):
         if child.suffix.lower() in RECORDING_SUFFIXES and child.is_file():
             raise unknown_file(child, _head(child))
-    if is_without_images(path):  # its reader says what it lacks
-        return [_Found(path, RGBD_FOLDER, _RgbdFolders())]
+    if rgbd_folder.is_without_images(path):  # its reader says what it lacks
+        return [_Found(path, RGBD_FOLDER, rgbd_folder)]
     raise empty_folder(path)
 
 
 def _tell_left_out(path: Path, inside: Sequence[_Found]) -> None:
     """Name what looks like one more camera and is none."""
     from rigcal.sources.rgbd_folder import is_without_images
-    from rigcal.sources.unknown import RECORDING_SUFFIXES, why_left_out
+    from rigcal.sources.unknown import RECORDING_SUFFIXES, what_it_is
 
     used = {one.path for one in inside}
     for child in _considered(path):
@@ -191,7 +193,7 @@ def _tell_left_out(path: Path, inside: Sequence[_Found]) -> None:
             if inside[0].kind == RGBD_FOLDER and path not in used and is_without_images(child):
                 logger.warning("{}: is left out: it has camera_info.yaml but no image", child)
         elif child.suffix.lower() in RECORDING_SUFFIXES:
-            why = why_left_out(child, _head(child)) if child.is_file() else "is no file that could be read"
+            why = what_it_is(child, _head(child)) if child.is_file() else "is no file that could be read"
             logger.warning("{}: is left out: {}", child, why)
 
 
@@ -213,25 +215,11 @@ def _children(path: Path, *, but_images: bool = False) -> Iterator[_Found]:
 def _folder(path: Path) -> _Found | None:
     from rigcal.sources import rgbd_folder
 
-    if rgbd_folder.is_rgbd_folder(path):
-        return _Found(path, RGBD_FOLDER, _RgbdFolders())
+    if rgbd_folder.recognises(path, b""):
+        return _Found(path, RGBD_FOLDER, rgbd_folder)
     from rigcal.sources import ros_bag
 
     return _Found(path, "ROS bag", ros_bag) if ros_bag.recognises(path, b"") else None
-
-
-class _RgbdFolders:
-    """The reader of RGB-D folders in the shape of the others."""
-
-    def recognises(self, path: Path, head: bytes) -> bool:
-        from rigcal.sources.rgbd_folder import is_rgbd_folder
-
-        return is_rgbd_folder(path)
-
-    def opened(self, path: Path, options: SourceOptions) -> Recording:
-        from rigcal.sources.rgbd_folder import RgbdFolder
-
-        return RgbdFolder(path)
 
 
 def _file(path: Path) -> _Found | None:

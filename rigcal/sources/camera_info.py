@@ -19,13 +19,14 @@ import yaml
 from numpy.typing import NDArray
 
 from aruco.errors import InputError
-from aruco.model import Camera, DistortionModel
+from aruco.model import MAX_IMAGE_SIDE_PX, Camera, DistortionModel
 from aruco.pose_math import Array
 
 FILE_NAME = "camera_info.yaml"
 REQUIRED = ("image_width", "image_height", "camera_matrix", "distortion_model", "distortion_coefficients")
 # A camera_info has about 2 kB; the parser takes a second for this much.
 MAX_FILE_BYTES = 64 * 2**10
+_SIDES, _COUNTS = range(1, MAX_IMAGE_SIDE_PX + 1), range(MAX_FILE_BYTES)
 
 
 def load_camera_info(path: Path, name: str) -> Camera:
@@ -48,8 +49,8 @@ def load_camera_info(path: Path, name: str) -> Camera:
     try:
         return Camera(
             name=name,
-            width=_whole(content["image_width"], "image_width"),
-            height=_whole(content["image_height"], "image_height"),
+            width=_whole(content["image_width"], "image_width", _SIDES),
+            height=_whole(content["image_height"], "image_height", _SIDES),
             K=_matrix(content, "camera_matrix", (3, 3)),
             distortion_model=cast(DistortionModel, _word(content["distortion_model"], "distortion_model")),
             distortion=_matrix(content, "distortion_coefficients", None).ravel(),
@@ -109,10 +110,10 @@ def _word(value: object, key: str) -> str:
     return value
 
 
-def _whole(value: object, key: str) -> int:
+def _whole(value: object, key: str, allowed: range) -> int:
     word = _word(value, key)
-    if not re.fullmatch("[0-9]{1,9}", word):
-        raise InputError(f"{key} must be a whole number, got {word[:40]!r}.")
+    if not re.fullmatch("[0-9]{1,9}", word) or int(word) not in allowed:
+        raise InputError(f"{key} must be a whole number from {allowed[0]} to {allowed[-1]}, got {word[:40]!r}.")
     return int(word)
 
 
@@ -132,7 +133,7 @@ def _matrix(content: Mapping[str, Any], key: str, shape: tuple[int, int] | None)
     data = np.array([_number(value, key) for value in entry["data"]], dtype=np.float64)
     rows, cols = shape or (1, len(data))
     stated = tuple(
-        _whole(entry.get(word, str(size)), f"{key}: {word}") for word, size in (("rows", rows), ("cols", cols))
+        _whole(entry.get(word, str(size)), f"{key}: {word}", _COUNTS) for word, size in (("rows", rows), ("cols", cols))
     )
     if stated != (rows, cols) or len(data) != rows * cols:
         raise InputError(

@@ -1,14 +1,15 @@
-"""Containers that keep messages in chunks (MCAP, ROS 1 bags): where messages lie, and reading one of them.
+"""Containers that keep messages in chunks (MCAP, ROS 1 bags): reading one message of them, or a part of many.
 
-Owns      the index of messages while and after it is built, chunks that turn out to be damaged, memory.
-Leaves    what records look like to mcap_walk and rosbag1_index, compressed blocks to decompression.
+Owns      finding and reading a message, chunks that turn out to be damaged, memory.
+Leaves    the index to message_places, what records look like to mcap_walk and rosbag1_index, compressed blocks to
+          decompression.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Protocol
 
@@ -17,36 +18,12 @@ from loguru import logger
 from numpy.typing import NDArray
 
 from aruco.errors import InputError
-from rigcal.sources.decompression import DamagedError, decompressed
-
-# A day of a 400 Hz sensor has 35 million; each costs 20 bytes here.
-MAX_MESSAGES = 100_000_000
-NO_CHUNK = -1
+from rigcal.sources.decompression import MAX_CHUNK_BYTES, DamagedError, decompressed
+from rigcal.sources.message_places import NO_CHUNK, Chunk, IndexBuilder, Places
 
 Read = Callable[[int, int], bytes]  # (at, size)
 # (read, at, end, channel) -> (begin, size) of the message whose record begins at ``at``; raises DamagedError.
 Extent = Callable[[Read, int, int, int], tuple[int, int]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Chunk:
-    """Messages that are stored together."""
-
-    at: int  # of the stored contents in the file
-    stored: int  # bytes there
-    stated: int  # bytes when decompressed
-    compression: str
-    crc: int = 0  # of the decompressed bytes; 0: not known
-    cut: bool = False  # the file ends within
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Places:
-    """The messages of one channel in the order in which they lie in the file."""
-
-    log_times_ns: NDArray[np.int64]  # (n,)
-    chunks: NDArray[np.int32]  # (n,) number of the chunk, NO_CHUNK: in none
-    offsets: NDArray[np.int64]  # (n,) of the message's record in the chunk or in the file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,97 +34,6 @@ class Part:
     index: int
     total: int  # bytes of the whole message
     data: bytes | None  # None: the message is lost
-
-
-@dataclass(slots=True, kw_only=True, eq=False)
-class _Pieces:
-    """A channel's places as they come."""
-
-    log_times_ns: list[NDArray[np.int64]] = field(default_factory=list)
-    chunks: list[NDArray[np.int32]] = field(default_factory=list)
-    offsets: list[NDArray[np.int64]] = field(default_factory=list)
-
-
-class IndexBuilder:
-    """Chunks and places, gathered in one walk through a file."""
-
-    def __init__(self) -> None:
-        self.chunks: list[Chunk] = []
-        self.unindexed: set[int] = set()  # chunks whose index has not been seen whole
-        self.users: dict[int, set[int]] = {}  # chunk -> channels that its index names
-        self._pieces: dict[int, _Pieces] = {}
-        self._pending: list[tuple[int, NDArray[np.int64]]] = []  # index of the last chunk
-        self._total = 0
-
-    @property
-    def channels(self) -> set[int]:
-        """Channels that have messages."""
-        return set(self._pieces)
-
-    def begin_chunk(self, chunk: Chunk) -> None:
-        """A chunk; it counts as unindexed until ``settle``."""
-        self.unindexed.add(len(self.chunks))
-        self.chunks.append(chunk)
-
-    def index_last_chunk(self, channel: int, entries: NDArray[np.int64]) -> None:
-        """A piece of the index, (n, 2) of log time and offset, that follows the last chunk."""
-        if self.chunks:
-            self._pending.append((channel, entries))
-
-    def settle(self, *, whole: bool = True) -> None:
-        """The index of the last chunk has ended; where the file ends with it, it need not be whole."""
-        if self._pending and whole:
-            number = len(self.chunks) - 1
-            self.unindexed.discard(number)
-            for channel, entries in self._pending:
-                self.add(channel, entries, number)
-                if len(entries):
-                    self.users.setdefault(number, set()).add(channel)
-        self._pending = []
-
-    def add(self, channel: int, entries: NDArray[np.int64], chunk: int) -> None:
-        """Messages of one channel, (n, 2) of log time and offset, in one chunk."""
-        self._total += len(entries)
-        if self._total > MAX_MESSAGES:
-            raise DamagedError(f"has more than {MAX_MESSAGES} messages")
-        if len(entries):
-            pieces = self._pieces.setdefault(channel, _Pieces())
-            pieces.log_times_ns.append(entries[:, 0].copy())
-            pieces.offsets.append(entries[:, 1].copy())
-            pieces.chunks.append(np.full(len(entries), chunk, dtype=np.int32))
-
-    def places(self, channel: int) -> Places:
-        """Where a channel's messages lie, in the file's order."""
-        pieces = self._pieces.get(channel)
-        if pieces is None:
-            nothing = np.empty(0, dtype=np.int64)
-            return Places(log_times_ns=nothing, chunks=np.empty(0, dtype=np.int32), offsets=nothing)
-        times, offsets = np.concatenate(pieces.log_times_ns), np.concatenate(pieces.offsets)
-        chunks = np.concatenate(pieces.chunks)
-        order = np.lexsort((offsets, chunks))
-        return Places(log_times_ns=times[order], chunks=chunks[order], offsets=offsets[order])
-
-    def must_look_into(self, chunk: int, known: Collection[int]) -> bool:
-        """Whether a chunk has no index, or its index names a channel that is not among the known ones."""
-        return chunk in self.unindexed or not self.users.get(chunk, set()) <= {*known}
-
-    def loss(self, at: int, size: int) -> str:
-        """How a file of so many bytes ends that is cut off in the record at some byte; completes "<file> ..."."""
-        return (
-            f"is cut off: the record at byte {at} of {size} is not whole; the {self._span_s():.3f} s of messages "
-            "before are used"
-        )
-
-    def _span_s(self) -> float:
-        """Seconds from the first message to the last."""
-        span = span_of([times for pieces in self._pieces.values() for times in pieces.log_times_ns])
-        return 0.0 if span is None else (span[1] - span[0]) / 1e9
-
-
-def span_of(log_times_ns: Sequence[NDArray[np.int64]]) -> tuple[int, int] | None:
-    """The first and the last of all times; None where there are none."""
-    times = [times for times in log_times_ns if len(times)]
-    return (min(int(t.min()) for t in times), max(int(t.max()) for t in times)) if times else None
 
 
 class Walk(Protocol):
@@ -186,15 +72,14 @@ class ChunkedFile:
         self._cached: tuple[int, memoryview] | None = None
         self._lost: set[int] = set()
 
-    def walk_through(self, walk: Walk, what: str) -> None:
+    def walk_through(self, walk: Walk) -> None:
         """Find the chunks and what lies in them; no message is read.
 
         Args:
             walk: Over the file's records; its index has the chunks.
-            what: The file is: "file", "bag".
 
         Raises:
-            InputError: It is something else, damaged beyond use, or of absurd sizes.
+            InputError: It cannot be read, is something else, or has too many messages.
         """
         try:
             with self.path.open("rb") as file:
@@ -205,12 +90,11 @@ class ChunkedFile:
                         walk.look_into(self.contents(file, number), number)
                     except DamagedError as error:
                         logger.debug("{}: chunk {} is not indexed: {}", self.path, number, error)
+                walk.index.tell_left_out()
         except OSError as error:
             raise InputError(
                 f"{self.path}: cannot be read ({error.strerror or error}); mend its permissions."
             ) from error
-        except DamagedError as error:
-            raise InputError(f"{self.path}: {error}; record or copy the {what} again.") from error
 
     def log_times_ns(self, channel: int) -> NDArray[np.int64]:
         """(n,) when each message was logged, in the order in which they lie in the file."""
@@ -225,20 +109,21 @@ class ChunkedFile:
         except OSError as error:
             raise DamagedError(f"cannot be read ({error.strerror or error})") from error
 
-    def parts(self, channels: Sequence[int], size: int, *, start: int = 0) -> Iterator[Part]:
-        """A few bytes of every message of some channels; chunks that are not compressed are not read for it.
+    def parts(self, channels: Sequence[int], size: int, *, start: int = 0, step: int = 1) -> Iterator[Part]:
+        """A few bytes of each message of some channels; chunks that are not compressed are not read for it.
 
         Args:
             channels: Ids of the channels wanted.
             size: How many bytes of each message, at most.
             start: Of which byte on; negative: counted from the message's end.
+            step: Only each ``step``-th message of a channel, from the first on, is looked at.
 
         Yields:
             The parts in the order in which the messages lie in the file. Checksums are not looked at where the chunk
             is not read.
         """
         with self.path.open("rb") as file:
-            for which, index in _file_order([self.places[channel] for channel in channels]):
+            for which, index in _file_order([self.places[channel] for channel in channels], step):
                 channel = channels[which]
                 try:
                     read, begin, total = self._found(file, channel, index, whole=False)
@@ -260,6 +145,10 @@ class ChunkedFile:
         self._cached = None
         chunk = self._chunks[number]
         try:
+            if chunk.damage:
+                raise DamagedError(chunk.damage)
+            if max(chunk.stored, chunk.stated) > MAX_CHUNK_BYTES:
+                raise DamagedError(f"states {max(chunk.stored, chunk.stated)} bytes, more than 1 GiB")
             file.seek(chunk.at)
             data = decompressed(file.read(chunk.stored), chunk.compression, chunk.stated, cut=chunk.cut)
             if chunk.crc and not chunk.cut and zlib.crc32(data) != chunk.crc:
@@ -277,7 +166,7 @@ class ChunkedFile:
         number, offset = int(places.chunks[index]), int(places.offsets[index])
         if number == NO_CHUNK:
             read, end = reader(file), file.seek(0, 2)
-        elif not whole and self._chunks[number].compression in ("", "none"):
+        elif not whole and self._chunks[number].is_plain:
             read, end = reader(file, self._chunks[number].at), self._chunks[number].stored
         else:
             data = self.contents(file, number)
@@ -285,16 +174,14 @@ class ChunkedFile:
         return read, *self._extent(read, offset, end, channel)
 
 
-def _file_order(places: Sequence[Places]) -> Iterator[tuple[int, int]]:
-    """(which, index) of all messages in the order in which they lie in the file."""
+def _file_order(places: Sequence[Places], step: int) -> Iterator[tuple[int, int]]:
+    """(which, index) of each channel's every ``step``-th message, in the order in which they lie in the file."""
     if not places:
         return
-    counts = [len(place.offsets) for place in places]
-    which = np.repeat(np.arange(len(places)), counts)
-    index = np.concatenate([np.arange(count) for count in counts])
-    order = np.lexsort(
-        (np.concatenate([place.offsets for place in places]), np.concatenate([place.chunks for place in places]))
-    )
+    offsets = [place.offsets[::step] for place in places]
+    which = np.repeat(np.arange(len(places)), [len(some) for some in offsets])
+    index = np.concatenate([step * np.arange(len(some)) for some in offsets])
+    order = np.lexsort((np.concatenate(offsets), np.concatenate([place.chunks[::step] for place in places])))
     for at in order:
         yield int(which[at]), int(index[at])
 

@@ -31,41 +31,38 @@ def decompressed(data: bytes | memoryview, compression: str, stated: int, *, cut
     Args:
         data: The block as stored.
         compression: One of COMPRESSIONS.
-        stated: How many bytes it must yield, at most MAX_CHUNK_BYTES.
+        stated: How many bytes it must yield; more are not made of it.
         cut: The end of ``data`` is missing: what can be had is wanted.
 
     Returns:
         ``stated`` bytes, read-only; fewer only of a cut block.
 
     Raises:
-        DamagedError: The block is too large, damaged, or yields another size than stated.
+        DamagedError: The block is damaged, or yields another size than stated.
         MissingExtraError: The package for the compression is not installed.
     """
-    if stated > MAX_CHUNK_BYTES:
-        raise DamagedError(f"states {stated} bytes, more than the {MAX_CHUNK_BYTES >> 30} GiB that are read at once")
     if compression in ("", "none"):
         if len(data) != stated and not (cut and len(data) < stated):
             raise DamagedError(f"holds {len(data)} bytes and states {stated}")
         return memoryview(data).toreadonly()
-    out, filled = bytearray(stated), 0
+    out = bytearray()  # grows with what is there: what a damaged block states is not believed
     for piece in _told_pieces(data, compression, cut):
-        if filled + len(piece) > stated:
+        if len(out) + len(piece) > stated:
             raise DamagedError(f"yields more than the {stated} bytes that it states")
-        out[filled : filled + len(piece)] = piece
-        filled += len(piece)
-    if filled != stated and not cut:
-        raise DamagedError(f"yields {filled} bytes and states {stated}")
-    return memoryview(out)[:filled].toreadonly()
+        out += piece
+    if len(out) != stated and not cut:
+        raise DamagedError(f"yields {len(out)} bytes and states {stated}")
+    return memoryview(out).toreadonly()
 
 
 def decompressed_head(data: bytes | memoryview, compression: str, size: int) -> bytes:
     """The first ``size`` bytes that a block yields, fewer if it has fewer; raises DamagedError."""
-    head = b""
+    head = bytearray()
     for piece in _told_pieces(data, compression, False, min(size, _PIECE_BYTES)):
         head += piece
         if len(head) >= size:
             break
-    return head[:size]
+    return bytes(head[:size])
 
 
 def _told_pieces(

@@ -120,9 +120,14 @@ def encode_png(image: NDArray[Any]) -> bytes:
 
 
 def encode_depth(depth_m: NDArray[np.float32], depth_scale: float) -> bytes:
-    """The bytes of a 16-bit depth PNG of (h, w) metres; NaN and what 16 bits cannot hold become 0."""
-    units = np.rint(np.nan_to_num(depth_m.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / depth_scale)
-    return encode_png(np.where((units > 0) & (units <= 65535), units, 0).astype(np.uint16))
+    """The bytes of a 16-bit depth PNG of (h, w) metres; see depth_steps."""
+    return encode_png(depth_steps(depth_m, depth_scale))
+
+
+def depth_steps(depth_m: NDArray[np.float32], step_m: float) -> NDArray[np.uint16]:
+    """(h, w) metres as whole multiples of a step; NaN and what 16 bits cannot hold become 0."""
+    steps = np.rint(np.nan_to_num(depth_m.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / step_m)
+    return np.where((steps > 0) & (steps <= 65535), steps, 0).astype(np.uint16)
 
 
 def _read_npy(path: Path, size: tuple[int, int] | None) -> NDArray[np.float32]:

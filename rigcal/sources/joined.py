@@ -50,14 +50,13 @@ class JoinedRecording:
     """Several recordings as one; implements aruco.model.Recording and KnowsUp."""
 
     def __init__(self, opened: Sequence[tuple[Path, Recording]]) -> None:
-        self._owners: dict[str, Recording] = {}
-        places: dict[str, Path] = {}
+        owners: dict[str, tuple[Path, Recording]] = {}
         for path, recording in opened:
             for camera in recording.cameras:
-                if camera.name in places:
-                    raise _same_name(camera.name, places[camera.name], path)
-                places[camera.name] = path
-                self._owners[camera.name] = recording
+                if camera.name in owners:
+                    raise _same_name(camera.name, owners[camera.name], (path, recording))
+                owners[camera.name] = (path, recording)
+        self._owners = {name: recording for name, (_, recording) in owners.items()}
         cameras = [camera for _, recording in opened for camera in recording.cameras]
         self._cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
 
@@ -89,13 +88,25 @@ class JoinedRecording:
         return self._owners[camera]
 
 
-def _same_name(name: str, one: Path, other: Path) -> InputError:
+def _same_name(name: str, *two: tuple[Path, Recording]) -> InputError:
+    one, other = (path for path, _ in two)
     if one.resolve() == other.resolve():
         return InputError(f"{one}: is given twice; leave one out.")
+    ways = [way for path, recording in two if (way := _renaming(name, path, recording)) is not None]
+    # Other names come from inside the file: a serial number is always of one camera, a topic need not be.
+    way = ways[-1] if ways else "make one a folder with rigcal convert and rename the camera's folder there"
     return InputError(
-        f"camera {name} is in {one} and in {other}; rename it in one of them (its folder, its video file, or its topic "
-        "with --topics), or leave one out."
+        f"camera {name} is in {one} and in {other}; give one of them at a time or, if these are two cameras, {way}."
     )
+
+
+def _renaming(name: str, path: Path, recording: Recording) -> str | None:
+    """How a camera is renamed where it is called like a file or folder."""
+    from rigcal.sources.rgbd_folder import RgbdFolder
+
+    if isinstance(recording, RgbdFolder):
+        return f"rename its folder in {path.parent if path.resolve().name == name else path}"
+    return f"rename {recording.file_of(name)}" if isinstance(recording, HasFiles) else None
 
 
 class _Span(NamedTuple):

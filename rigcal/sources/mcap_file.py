@@ -13,7 +13,8 @@ from loguru import logger
 
 from aruco.errors import InputError
 from aruco.model import Recording
-from rigcal.sources.mcap_index import MAGIC, McapChannel, McapIndex
+from rigcal.sources.mcap_index import McapChannel, McapIndex
+from rigcal.sources.mcap_records import MAGIC
 from rigcal.sources.message_store import READABLE, ChannelStore, Topic, plain_type
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.ros_topics import listing

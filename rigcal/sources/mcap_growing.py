@@ -17,14 +17,12 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, NamedTuple
 
 from aruco.errors import MissingExtraError, OutputError
+from rigcal.sources.mcap_records import MAGIC, RECORD, Opcode
 
 if TYPE_CHECKING:
     from mcap.records import Channel, McapRecord, Schema
 
-MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")  # opcode, length
 _TIMES = struct.Struct("<QQQ")  # of a chunk: first and last log time, size of its records
-_CHUNK, _MESSAGE_INDEX = 0x06, 0x07
 
 
 class ChunkMessage(NamedTuple):
@@ -67,7 +65,7 @@ def packed_chunk(messages: Sequence[ChunkMessage], *, compressed: bool) -> Packe
             uncompressed_size=len(records),
         )
     )
-    return PackedChunk(record, indexes, record[_RECORD.size :][: _TIMES.size], compression, len(stored))
+    return PackedChunk(record, indexes, record[RECORD.size :][: _TIMES.size], compression, len(stored))
 
 
 class GrowingMcap:
@@ -134,16 +132,16 @@ class GrowingMcap:
             schema_count=len(self._schemas),
         )
         groups = [
-            (0x03, _written(*self._schemas)),
-            (0x04, _written(*self._channels)),
-            (0x0B, _written(statistics)),
-            (0x08, b"".join(self._indexes)),
+            (Opcode.SCHEMA, _written(*self._schemas)),
+            (Opcode.CHANNEL, _written(*self._channels)),
+            (Opcode.STATISTICS, _written(statistics)),
+            (Opcode.CHUNK_INDEX, b"".join(self._indexes)),
         ]
         summary = b"".join(data for _, data in groups)
         offsets_start = start + len(summary)
         summary += _summary_offsets(start, groups)
         # The checksum covers the footer too, up to itself.
-        footer = _RECORD.pack(0x02, 20) + struct.pack("<QQ", start, offsets_start)
+        footer = RECORD.pack(Opcode.FOOTER, 20) + struct.pack("<QQ", start, offsets_start)
         crc = zlib.crc32(footer, zlib.crc32(summary))
         self._file.write(summary + _written(Footer(start, offsets_start, crc)) + MAGIC)
         self.close()
@@ -192,13 +190,13 @@ def has_chunk(path: Path) -> bool:
     size = path.stat().st_size
     with path.open("rb") as file:
         at = len(MAGIC)
-        while at + _RECORD.size <= size:  # the header, schemas and channels first
+        while at + RECORD.size <= size:  # the header, schemas and channels first
             file.seek(at)
-            opcode, length = _RECORD.unpack(file.read(_RECORD.size))
-            if opcode == _CHUNK:
+            opcode, length = RECORD.unpack(file.read(RECORD.size))
+            if opcode == Opcode.CHUNK:
                 group = _group(file, at, size)
                 return group is not None and bool(group.lengths)
-            at += _RECORD.size + length
+            at += RECORD.size + length
     return False
 
 
@@ -214,25 +212,25 @@ class _Group(NamedTuple):
 
 def _group(file: IO[bytes], at: int, size: int) -> _Group | None:
     """The whole chunk at an offset with its whole indexes; None: there is none."""
-    if at + _RECORD.size > size:
+    if at + RECORD.size > size:
         return None
     file.seek(at)
-    opcode, length = _RECORD.unpack(file.read(_RECORD.size))
-    end = at + _RECORD.size + length
-    if opcode != _CHUNK or end > size:
+    opcode, length = RECORD.unpack(file.read(RECORD.size))
+    end = at + RECORD.size + length
+    if opcode != Opcode.CHUNK or end > size:
         return None
     head = file.read(_TIMES.size + 8)
     compression = file.read(int.from_bytes(head[-4:], "little")).decode()
     stored = int.from_bytes(file.read(8), "little")
     lengths: dict[int, int] = {}
     index = end
-    while index + _RECORD.size <= size:
+    while index + RECORD.size <= size:
         file.seek(index)
-        opcode, length = _RECORD.unpack(file.read(_RECORD.size))
-        if opcode != _MESSAGE_INDEX or index + _RECORD.size + length > size:
+        opcode, length = RECORD.unpack(file.read(RECORD.size))
+        if opcode != Opcode.MESSAGE_INDEX or index + RECORD.size + length > size:
             break
-        lengths[int.from_bytes(file.read(2), "little")] = _RECORD.size + length
-        index += _RECORD.size + length
+        lengths[int.from_bytes(file.read(2), "little")] = RECORD.size + length
+        index += RECORD.size + length
     return _Group(end - at, head[: _TIMES.size], compression, stored, lengths)
 
 
@@ -250,7 +248,9 @@ def _summary_offsets(start: int, groups: Sequence[tuple[int, bytes]]) -> bytes:
     """Where the groups of the summary begin, for readers that want only one of them."""
     offsets = b""
     for opcode, data in groups:
-        offsets += _RECORD.pack(0x0E, 17) + struct.pack("<BQQ", opcode, start, len(data)) if data else b""
+        offsets += (
+            RECORD.pack(Opcode.SUMMARY_OFFSET, 17) + struct.pack("<BQQ", opcode, start, len(data)) if data else b""
+        )
         start += len(data)
     return offsets
 

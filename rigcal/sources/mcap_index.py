@@ -11,9 +11,10 @@ from pathlib import Path
 
 from rigcal.sources.chunked_file import ChunkedFile, Part, Read
 from rigcal.sources.decompression import MAX_MESSAGE_BYTES, DamagedError
-from rigcal.sources.mcap_walk import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD, McapChannel, McapWalk
+from rigcal.sources.mcap_records import RECORD, Opcode
+from rigcal.sources.mcap_walk import MESSAGE_HEAD, McapChannel, McapWalk
 
-__all__ = ["MAGIC", "DamagedError", "McapChannel", "McapIndex", "Part"]
+__all__ = ["DamagedError", "McapChannel", "McapIndex", "Part"]
 
 
 class McapIndex(ChunkedFile):
@@ -27,12 +28,12 @@ class McapIndex(ChunkedFile):
             extra: Which of rigcal's extras a user lacks who has no mcap package.
 
         Raises:
-            InputError: Not an MCAP file, damaged beyond use, or of absurd sizes.
+            InputError: Not an MCAP file, or one of too many messages.
             MissingExtraError: The package mcap is not installed.
         """
         walk = McapWalk(path, extra)
         super().__init__(path, walk.index.chunks, _extent)
-        self.walk_through(walk, "file")
+        self.walk_through(walk)
         self.loss: str | None = walk.loss()  # how a file ends that is cut off: "<file> ..."
         self.profile, self.library = walk.header  # "ros2", and who wrote the file
         self.metadata: Mapping[str, Mapping[str, str]] = walk.metadata  # name -> its entries
@@ -52,7 +53,7 @@ def _extent(read: Read, at: int, end: int, channel: int) -> tuple[int, int]:
         raise DamagedError("is not where the index says")
     opcode, length = RECORD.unpack_from(start)
     size = length - MESSAGE_HEAD.size
-    if opcode != MESSAGE or MESSAGE_HEAD.unpack_from(start, RECORD.size)[0] != channel:
+    if opcode != Opcode.MESSAGE or MESSAGE_HEAD.unpack_from(start, RECORD.size)[0] != channel:
         raise DamagedError("is not where the index says")
     if not 0 <= size <= MAX_MESSAGE_BYTES or begin + size > end:
         raise DamagedError(f"states {size} bytes, more than a message or its chunk has")

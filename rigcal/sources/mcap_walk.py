@@ -20,19 +20,17 @@ import numpy as np
 from loguru import logger
 
 from aruco.errors import InputError, MissingExtraError
-from rigcal.sources.chunked_file import NO_CHUNK, Chunk, IndexBuilder
-from rigcal.sources.decompression import MAX_CHUNK_BYTES, DamagedError
+from rigcal.sources.decompression import MAX_CHUNK_BYTES
+from rigcal.sources.mcap_records import MAGIC, RECORD, Opcode
+from rigcal.sources.message_places import NO_CHUNK, Chunk, IndexBuilder
 
-MAGIC = b"\x89MCAP0\r\n"
 # A schema with all that it refers to has some 10 kB.
 MAX_DEFINITION_BYTES = 16 * 2**20
 MAX_COMPRESSION_NAME_BYTES = 64
 
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 1, 2, 3, 4, 5, 6, 7, 0xC
-_DATA_END = 0xF
-RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time, size and CRC of the contents, length of compression
-MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+# Channel, sequence, log time, publish time; times that exceed 63 bits are nonsense and become negative.
+MESSAGE_HEAD = struct.Struct("<HIqq")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,12 +58,11 @@ class McapWalk:
         self._records, self._stream = records, ReadDataStream
         self._path = path
         self._size = 0
-        self.index = IndexBuilder()
+        self.index = IndexBuilder(path)
         self.header = ("", "")  # profile and library
         self.metadata: dict[str, dict[str, str]] = {}
         self._schemas: dict[int, Any] = {}
         self._channels: dict[int, Any] = {}
-        self._loose: dict[int, list[tuple[int, int]]] = {}  # messages outside of chunks
         self._cut_at: int | None = None
         self._has_all_data = False
 
@@ -77,7 +74,7 @@ class McapWalk:
             raise InputError(f"{self._path}: is not an MCAP file; check the path.")
         at, opcode = len(MAGIC), 0
         handlers = self._handlers()
-        while opcode != _FOOTER:
+        while opcode != Opcode.FOOTER:
             file.seek(at)
             head = file.read(RECORD.size)
             opcode, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
@@ -85,13 +82,12 @@ class McapWalk:
             if opcode == 0 or end > self._size:
                 self._cut(file, at, opcode, body)
                 break
-            if opcode != _MESSAGE_INDEX:
+            if opcode != Opcode.MESSAGE_INDEX:
                 self.index.settle()
             if opcode in handlers:
                 handlers[opcode](file, body, length)
-            self._has_all_data |= opcode == _DATA_END
+            self._has_all_data |= opcode == Opcode.DATA_END
             at = end
-        self._add(self._loose, NO_CHUNK)
 
     def must_look_into(self, chunk: int) -> bool:
         """Whether a chunk has no index, or its index names a channel of which no definition is known yet."""
@@ -100,19 +96,18 @@ class McapWalk:
     def look_into(self, data: memoryview, chunk: int) -> None:
         """Definitions, and messages where there is no index, of those records of a chunk that are whole."""
         with_messages = chunk in self.index.unindexed
-        at, found = 0, dict[int, list[tuple[int, int]]]()
+        at = 0
         while at + RECORD.size <= len(data):
             opcode, length = RECORD.unpack_from(data, at)
             body, end = at + RECORD.size, at + RECORD.size + length
             if end > len(data):
                 break
-            if opcode == MESSAGE and with_messages and length >= MESSAGE_HEAD.size:
-                channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, body)
-                found.setdefault(channel, []).append((log_time, at))
-            elif opcode in (_SCHEMA, _CHANNEL) and length <= MAX_DEFINITION_BYTES:
-                self._define(opcode, bytes(data[body:end]))
+            if opcode == Opcode.MESSAGE and with_messages and length >= MESSAGE_HEAD.size:
+                channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(data, body)
+                self.index.add_one(channel, log_time_ns, at, chunk)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and length <= MAX_DEFINITION_BYTES:
+                self._define(opcode, bytes(data[body:end]), self.index.chunks[chunk].at)
             at = end
-        self._add(found, chunk)
 
     def known_channels(self) -> tuple[McapChannel, ...]:
         """The channels that are defined, sorted by topic and id."""
@@ -143,83 +138,80 @@ class McapWalk:
         return self.index.loss(self._cut_at, self._size)
 
     def _handlers(self) -> Mapping[int, Callable[[IO[bytes], int, int], None]]:
-        def define(opcode: int) -> Callable[[IO[bytes], int, int], None]:
-            return lambda file, at, length: self._define(opcode, self._body(file, at, length))
+        def define(opcode: Opcode) -> Callable[[IO[bytes], int, int], None]:
+            # What is longer is read as far as that, and so is damaged.
+            return lambda file, at, length: self._define(opcode, file.read(min(length, MAX_DEFINITION_BYTES)), at)
 
         return {
-            _HEADER: define(_HEADER),
-            _SCHEMA: define(_SCHEMA),
-            _CHANNEL: define(_CHANNEL),
-            _METADATA: define(_METADATA),
-            MESSAGE: self._message,
-            _CHUNK: self._chunk,
-            _MESSAGE_INDEX: self._message_index,
+            **{opcode: define(opcode) for opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)},
+            Opcode.MESSAGE: self._message,
+            Opcode.CHUNK: self._chunk,
+            Opcode.MESSAGE_INDEX: self._message_index,
         }
 
-    def _body(self, file: IO[bytes], at: int, length: int, limit: int = MAX_DEFINITION_BYTES) -> bytes:
-        if length > limit:
-            raise DamagedError(f"the record at byte {at} states {length} bytes, more than such a record has")
-        file.seek(at)
-        return file.read(length)
-
-    def _define(self, opcode: int, body: bytes) -> None:
+    def _define(self, opcode: int, body: bytes, at: int) -> None:
         from mcap.exceptions import McapError
 
         stream = self._stream(BytesIO(body))
         try:
-            if opcode == _SCHEMA:
+            if opcode == Opcode.SCHEMA:
                 schema = self._records.Schema.read(stream)
                 self._schemas[schema.id] = schema
-            elif opcode == _CHANNEL:
+            elif opcode == Opcode.CHANNEL:
                 channel = self._records.Channel.read(stream)
                 self._channels[channel.id] = channel
-            elif opcode == _HEADER:
+            elif opcode == Opcode.HEADER:
                 header = self._records.Header.read(stream)
                 self.header = (header.profile, header.library)
             else:
                 metadata = self._records.Metadata.read(stream)
                 self.metadata[metadata.name] = metadata.metadata
         except (McapError, struct.error, ValueError) as error:
-            logger.warning("{}: a damaged record (opcode {}) is left out: {}", self._path, opcode, error)
+            self.index.leave_out(f"the one at byte {at} (opcode {opcode}): {error}")
 
     def _message(self, file: IO[bytes], at: int, length: int) -> None:
         head = file.read(MESSAGE_HEAD.size)
         if length >= MESSAGE_HEAD.size == len(head):
-            channel, _, log_time, _ = MESSAGE_HEAD.unpack(head)
-            self._loose.setdefault(channel, []).append((log_time, at - RECORD.size))
+            channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack(head)
+            self.index.add_one(channel, log_time_ns, at - RECORD.size, NO_CHUNK)
 
     def _chunk(self, file: IO[bytes], at: int, length: int, *, cut: bool = False) -> None:
-        head = file.read(_CHUNK_HEAD.size)
-        if len(head) < _CHUNK_HEAD.size:
-            return
-        _, _, stated, crc, name_length = _CHUNK_HEAD.unpack(head)
-        name = file.read(min(name_length, MAX_COMPRESSION_NAME_BYTES)).decode("utf-8", "replace")
-        stored = file.read(8)
-        begin = at + _CHUNK_HEAD.size + name_length + 8
-        if name_length > MAX_COMPRESSION_NAME_BYTES or len(stored) < 8 or begin > at + length:
-            raise DamagedError(f"the chunk at byte {at} has a damaged header")
-        size = int.from_bytes(stored, "little")
-        if max(stated, size) > MAX_CHUNK_BYTES:
-            raise DamagedError(f"the chunk at byte {at} states {max(stated, size)} bytes, more than 1 GiB")
-        size = min(size, at + length - begin)
-        self.index.begin_chunk(Chunk(at=begin, stored=size, stated=stated, compression=name, crc=crc, cut=cut))
+        head = file.read(min(length, _CHUNK_HEAD.size + MAX_COMPRESSION_NAME_BYTES + 8))
+        self.index.begin_chunk(_chunk_of(head, at, length, cut=cut))
 
     def _message_index(self, file: IO[bytes], at: int, length: int) -> None:
-        body = self._body(file, at, length, limit=MAX_CHUNK_BYTES)
+        body = file.read(length) if length <= MAX_CHUNK_BYTES else b""
         if len(body) < 6 or (len(body) - 6) % 16:
-            raise DamagedError(f"the index at byte {at} is damaged")
+            logger.debug("{}: the index at byte {} is damaged; its chunk is looked into", self._path, at)
+            self.index.spoil_last_index()
+            return
         # What exceeds 63 bits wraps to a negative number, which is refused when the message is read.
         entries = np.frombuffer(body, dtype="<i8", offset=6).reshape(-1, 2)
         self.index.index_last_chunk(int.from_bytes(body[:2], "little"), entries)
-
-    def _add(self, found: Mapping[int, list[tuple[int, int]]], chunk: int) -> None:
-        for channel, entries in found.items():
-            self.index.add(channel, np.array(entries, dtype=np.uint64).astype(np.int64), chunk)
 
     def _cut(self, file: IO[bytes], at: int, opcode: int, body: int) -> None:
         """The file ends here; a chunk that has begun is kept as far as it goes."""
         self._cut_at = at
         self.index.settle(whole=False)
         # A few bytes of its header are of no use.
-        if opcode == _CHUNK and self._size - body > _CHUNK_HEAD.size + MAX_COMPRESSION_NAME_BYTES:
+        if opcode == Opcode.CHUNK and self._size - body > _CHUNK_HEAD.size + MAX_COMPRESSION_NAME_BYTES:
             self._chunk(file, body, self._size - body, cut=True)
+
+
+def _chunk_of(head: bytes, at: int, length: int, *, cut: bool) -> Chunk:
+    """The chunk whose record has ``length`` bytes at ``at`` that begin with ``head``; its messages may be indexed."""
+    lost = Chunk(at=at, stored=length, stated=length, compression="", damage="has a damaged header")
+    if len(head) < _CHUNK_HEAD.size:
+        return lost
+    _, _, stated, crc, name_length = _CHUNK_HEAD.unpack_from(head)
+    begin = _CHUNK_HEAD.size + name_length + 8
+    if begin > len(head):
+        return lost
+    return Chunk(
+        at=at + begin,
+        stored=min(int.from_bytes(head[begin - 8 : begin], "little"), length - begin),
+        stated=stated,
+        compression=head[_CHUNK_HEAD.size : begin - 8].decode("utf-8", "replace"),
+        crc=crc,
+        cut=cut,
+    )

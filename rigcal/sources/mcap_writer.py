@@ -1,18 +1,7 @@
 """Writing frames as ROS 2 messages into an MCAP file, so that ROS 2, Foxglove and rigcal read them.
 
-Owns      topics, messages, and which frames of a file that was begun before are there.
-Leaves    the records of the file to mcap_growing, the bytes of images to image_file.
-
-A camera's topics stand in its namespace::
-
-    /<namespace>/image/compressed      sensor_msgs/msg/CompressedImage, PNG; header.frame_id is the camera's name
-    /<namespace>/camera_info           sensor_msgs/msg/CameraInfo
-    /<namespace>/depth/image           sensor_msgs/msg/Image, 16UC1 mm where that loses nothing, else 32FC1 m
-    /<namespace>/depth/camera_info
-    /<namespace>/confidence/image      sensor_msgs/msg/Image, mono8, 0..100, lower is more trustworthy
-
-A topic's parts may not begin with a digit in ROS 2, as serial numbers do. So the namespace may differ from the name,
-which stands in the channel's metadata too, as does the baseline, which no message holds.
+Owns      namespaces, messages, and which frames of a file that was begun before are there.
+Leaves    names of topics to rigcal_topics, the records of the file to mcap_growing, the bytes of images to image_file.
 """
 
 from __future__ import annotations
@@ -28,14 +17,21 @@ from numpy.typing import NDArray
 from aruco.errors import MissingExtraError, OutputError
 from aruco.model import Camera, Frame
 from aruco.pose_math import Array
-from rigcal.sources.image_file import encode_png
+from rigcal.sources.image_file import depth_steps, encode_png
 from rigcal.sources.mcap_growing import ChunkMessage, GrowingMcap, PackedChunk, packed_chunk
 from rigcal.sources.rgbd_writer import fits_steps
+from rigcal.sources.rigcal_topics import (
+    BASELINE_KEY,
+    CONFIDENCE,
+    DEPTH,
+    DEPTH_INFO,
+    IMAGE,
+    INFO,
+    NAME_KEY,
+    TOPICS,
+    TYPES,
+)
 
-NAME_KEY, BASELINE_KEY = "rigcal.camera", "rigcal.baseline_m"
-IMAGE, INFO, DEPTH, DEPTH_INFO, CONFIDENCE = range(5)
-_TOPICS = ("image/compressed", "camera_info", "depth/image", "depth/camera_info", "confidence/image")
-_TYPES = ("CompressedImage", "CameraInfo", "Image", "CameraInfo", "Image")
 _MM = 0.001
 # ROS's time has 32 bits of seconds, MCAP's has no sign.
 _MAX_STAMP_NS = 10**9 * 2**31
@@ -50,7 +46,7 @@ class McapFrames:
         Args:
             path: The file.
             cameras: All that it will have.
-            with_depth: Names of those that will have depth or confidence.
+            with_depth: Names of those that have depth; confidence without it is not written.
 
         Raises:
             OutputError: What is there is something else.
@@ -58,14 +54,15 @@ class McapFrames:
         """
         self._messages = _Messages()
         self._cameras = {camera.name: camera for camera in cameras}
+        self._with_depth = frozenset(with_depth)
         names = namespaces(self._cameras)
-        types = sorted(set(_TYPES))
-        self._first = {name: 1 + len(_TOPICS) * k for k, name in enumerate(names)}  # channel of a camera's images
+        types = sorted(set(TYPES))
+        self._first = {name: 1 + len(TOPICS) * k for k, name in enumerate(names)}  # channel of a camera's images
         channels = [
             self._messages.channel(self._first[name] + k, f"/{names[name]}/{topic}", types.index(kind) + 1, about)
             for name, about in ((name, _about(self._cameras[name])) for name in names)
-            for k, (topic, kind) in enumerate(zip(_TOPICS, _TYPES))
-            if k in (IMAGE, INFO) or name in with_depth
+            for k, (topic, kind) in enumerate(zip(TOPICS, TYPES))
+            if k in (IMAGE, INFO) or name in self._with_depth
         ]
         schemas = [self._messages.schema(k + 1, kind) for k, kind in enumerate(types)]
         self._file = GrowingMcap(path, schemas, channels, frozenset(self._first.values()))
@@ -88,11 +85,12 @@ class McapFrames:
         camera, first = self._cameras[frame.camera], self._first[frame.camera]
         head = self._messages.header(frame.stamp_ns, frame.camera)
         parts: list[tuple[int, memoryview]] = []
-        if frame.depth_m is not None:
+        has_depth = frame.camera in self._with_depth
+        if has_depth and frame.depth_m is not None:
             size = (frame.depth_m.shape[1], frame.depth_m.shape[0])
             parts.append((DEPTH, self._messages.depth(head, frame.depth_m)))
             parts.append((DEPTH_INFO, self._messages.info(head, size, camera.K_depth, "plumb_bob", np.zeros(5))))
-        if frame.confidence is not None:
+        if has_depth and frame.confidence is not None:
             parts.append((CONFIDENCE, self._messages.raw(head, frame.confidence, "mono8")))
         size = (camera.width, camera.height)
         parts.append((INFO, self._messages.info(head, size, camera.K, camera.distortion_model, camera.distortion)))
@@ -169,8 +167,7 @@ class _Messages:
 
     def depth(self, head: Any, depth_m: NDArray[np.float32]) -> memoryview:
         if fits_steps(depth_m, _MM):
-            units = np.rint(np.nan_to_num(depth_m.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / _MM)
-            return self.raw(head, units.astype(np.uint16), "16UC1")
+            return self.raw(head, depth_steps(depth_m, _MM), "16UC1")
         return self.raw(head, depth_m.astype(np.float32), "32FC1")
 
     def raw(self, head: Any, pixels: NDArray[Any], encoding: str) -> memoryview:

@@ -14,8 +14,9 @@ from typing import Protocol
 import numpy as np
 
 from aruco.errors import InputError
-from rigcal.sources.chunked_file import ChunkedFile, span_of
+from rigcal.sources.chunked_file import ChunkedFile
 from rigcal.sources.decompression import MAX_MESSAGE_BYTES, DamagedError, decompressed_head
+from rigcal.sources.message_places import span_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

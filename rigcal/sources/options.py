@@ -25,6 +25,7 @@ class SourceOptions:
     stereo_depth: bool = False  # depth of SVO2 files by semi-global matching
     topics: tuple[str, ...] = ()  # "<camera>=<image topic>[,<camera info topic>[,<depth topic>]]"
     same_clock: bool = False  # the first pictures of video files without a table of stamps are of one moment
-    intrinsics: Path | None = None  # of the cameras of videos; None: looked for beside them
+    intrinsics: Path | None = None  # of cameras; None: those in recordings, or beside videos
+    is_only: bool = True  # no other recording is read beside this one
     # Reads such a file: camera -> intrinsics; raises InputError where it holds none.
     read_cameras: Callable[[Path], Mapping[str, Camera]] = _no_reader

@@ -23,18 +23,29 @@ from loguru import logger
 from numpy.typing import NDArray
 
 from aruco.errors import InputError
-from aruco.model import BadFrame, Camera, Frame
+from aruco.model import BadFrame, Camera, Frame, name_trouble
 from aruco.svo_sync import MAX_STAMP_NS, default_tolerance_ns, nearest
 from rigcal.sources.camera_info import FILE_NAME, load_camera_info
 from rigcal.sources.image_file import ImageFileError, decode_8bit, read_bytes, read_depth
+from rigcal.sources.options import SourceOptions
 from rigcal.sources.rgbd_writer import write_recording
 
-__all__ = ["RgbdFolder", "is_rgbd_folder", "write_recording"]
+__all__ = ["RgbdFolder", "opened", "recognises", "write_recording"]
 
 IMAGE, DEPTH, CONFIDENCE = "image", "depth", "confidence"
 # Of two files with one stamp the suffix that comes first here wins.
 SUFFIXES = {IMAGE: (".png", ".jpg", ".jpeg"), DEPTH: (".png", ".npy"), CONFIDENCE: (".png",)}
 _STAMPED_NAME = re.compile(r"(-?[0-9]{1,19})(\.[a-z]+)", re.IGNORECASE)
+
+
+def recognises(path: Path, head: bytes) -> bool:
+    """Whether a folder holds a recording or a camera of one, as names tell: some camera has a folder of images."""
+    return any((folder / IMAGE).is_dir() for folder in _camera_folders(path))
+
+
+def opened(path: Path, options: SourceOptions) -> RgbdFolder:
+    """Open a recording folder, or the folder of a single camera; raises InputError as RgbdFolder does."""
+    return RgbdFolder(path)
 
 
 class RgbdFolder:
@@ -83,15 +94,9 @@ class RgbdFolder:
         return self._folders[camera]
 
 
-def is_rgbd_folder(path: Path) -> bool:
-    """Whether a folder holds a recording or a camera of one, as names tell: some camera has a folder of images."""
-    return any((folder / IMAGE).is_dir() for folder in _camera_folders(path))
-
-
 def is_without_images(path: Path) -> bool:
     """Whether a folder has cameras' descriptions alone, as an RGB-D folder without images has, and videos may have."""
-    folders = _camera_folders(path)
-    return bool(folders) and not any((folder / IMAGE).is_dir() for folder in folders)
+    return bool(_camera_folders(path)) and not recognises(path, b"")
 
 
 def _camera_folders(path: Path) -> list[Path]:
@@ -106,7 +111,10 @@ def _camera_folders(path: Path) -> list[Path]:
 
 
 def _is_camera(path: Path) -> bool:
-    return (path / IMAGE).is_dir() or (path / FILE_NAME).is_file()
+    if (path / FILE_NAME).is_file():
+        return True
+    # Of a recording that has a camera called image, that is not the folder of its images.
+    return (path / IMAGE).is_dir() and not (path / IMAGE / FILE_NAME).is_file()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,6 +170,8 @@ class _CameraFolder:
 
     @staticmethod
     def opened(path: Path) -> _CameraFolder:
+        if trouble := name_trouble(path.name):
+            raise InputError(f"{path.parent}: camera {path.name[:40]!r}: {trouble}; rename its folder.")
         files = {kind: _Stamped.listed(path / kind, suffixes) for kind, suffixes in SUFFIXES.items()}
         return _CameraFolder(
             camera=load_camera_info(path / FILE_NAME, path.name),

@@ -20,11 +20,10 @@ from loguru import logger
 from numpy.typing import NDArray
 
 from aruco.errors import OutputError
-from aruco.model import SILENT, BadFrame, Camera, Frame, Progress, Recording
+from aruco.model import SILENT, BadFrame, Camera, Frame, Progress, Recording, name_trouble
 from rigcal.sources.camera_info import FILE_NAME, dump_camera_info
 from rigcal.sources.image_file import encode_depth, encode_png
 
-MAX_NAME_BYTES = 200  # file systems hold 255, of which suffixes take some
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 # Of a file that is being written.
 _HALF = ".half"
@@ -47,39 +46,31 @@ def write_recording(recording: Recording, out: Path, *, depth: bool, progress: P
     total = sum(len(recording.stamps_ns(camera.name)) for camera in recording.cameras)
     done = 0
     with _appearing_whole(out) as part:
+        frames = RgbdFrames(part, recording.cameras, rounded=True)
         for camera in recording.cameras:
-            folder = part / camera.name
-            for kind in ("image", "depth", "confidence") if depth else ("image",):
-                (folder / kind).mkdir(parents=True)
             for frame in recording.frames(camera.name, range(len(recording.stamps_ns(camera.name))), depth=depth):
                 if isinstance(frame, BadFrame):
                     logger.warning("camera {}: frame {} is left out: {}", camera.name, frame.stamp_ns, frame.reason)
                 else:
-                    _write_frame(folder, camera, frame, depth)
+                    frames.store(frames.packed(frame))
                 done += 1
                 progress.step("write", done, total)
-        for camera in recording.cameras:
-            (part / camera.name / FILE_NAME).write_text(dump_camera_info(camera), encoding="utf-8")
-
-
-def _write_frame(folder: Path, camera: Camera, frame: Frame, depth: bool) -> None:
-    name = f"{frame.stamp_ns}.png"
-    (folder / "image" / name).write_bytes(encode_png(frame.image))
-    if depth and frame.depth_m is not None:
-        (folder / "depth" / name).write_bytes(encode_depth(frame.depth_m, camera.depth_scale))
-    if depth and frame.confidence is not None:
-        (folder / "confidence" / name).write_bytes(encode_png(frame.confidence))
+        frames.finish()
 
 
 class RgbdFrames:
-    """Frames in a folder that grows, and that a later run can go on with.
+    """Frames in a folder that grows, and that a later run can go on with."""
 
-    Nothing is lost: depth that 16-bit multiples of the camera's depth_scale do not hold is written as float32.
-    """
+    def __init__(self, folder: Path, cameras: Sequence[Camera], *, rounded: bool = False) -> None:
+        """Begin the folder, or go on with it.
 
-    def __init__(self, folder: Path, cameras: Sequence[Camera]) -> None:
-        """Begin the folder, or go on with it."""
-        self._folder = folder
+        Args:
+            folder: Where it is or will be.
+            cameras: All that it will have.
+            rounded: Depth is written in 16-bit multiples of the camera's depth_scale, as depth cameras do. Otherwise
+                nothing is lost: depth that such do not hold is written as float32.
+        """
+        self._folder, self._rounded = folder, rounded
         self._cameras = {camera.name: camera for camera in cameras}
         for name in self._cameras:
             refuse_unusable_name(name)
@@ -99,9 +90,9 @@ class RgbdFrames:
         folder, scale = self._folder / frame.camera, self._cameras[frame.camera].depth_scale
         files: list[tuple[Path, bytes]] = []
         if frame.depth_m is not None:
-            fits = fits_steps(frame.depth_m, scale)
-            data = encode_depth(frame.depth_m, scale) if fits else _npy(frame.depth_m)
-            files.append((folder / "depth" / f"{frame.stamp_ns}.{'png' if fits else 'npy'}", data))
+            as_png = self._rounded or fits_steps(frame.depth_m, scale)
+            data = encode_depth(frame.depth_m, scale) if as_png else _npy(frame.depth_m)
+            files.append((folder / "depth" / f"{frame.stamp_ns}.{'png' if as_png else 'npy'}", data))
         if frame.confidence is not None:
             files.append((folder / "confidence" / f"{frame.stamp_ns}.png", encode_png(frame.confidence)))
         # The image last: with it the frame is whole.
@@ -168,19 +159,13 @@ def _write_at_once(path: Path, data: bytes) -> None:
 
 
 def refuse_unusable_name(name: str) -> None:
-    """Refuse a camera's name that would lead elsewhere as a folder's.
+    """Refuse a camera's name that would lead elsewhere as a folder's, or that calibrating would refuse.
 
     Raises:
-        OutputError: It is empty, too long, holds a separator or leads upwards.
+        OutputError: It is one; see aruco.model.name_trouble.
     """
-    size = len(name.encode("utf-8", "surrogateescape"))
-    if size > MAX_NAME_BYTES:
-        raise OutputError(
-            f"camera {name[:40]!r}...: its name has {size} bytes, a folder's may have {MAX_NAME_BYTES}; rename the "
-            "camera."
-        )
-    if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
-        raise OutputError(f"camera {name!r}: a folder cannot have this name; rename the camera.")
+    if trouble := name_trouble(name):
+        raise OutputError(f"camera {name[:40]!r}: {trouble}; rename the camera.")
 
 
 @contextmanager

@@ -1,19 +1,18 @@
 """ROS bags: ROS 1 files (.bag) and rosbag2 folders (SQLite or MCAP files), also split ones.
 
-Owns      recognising them, metadata.yaml, and which files are one recording.
-Leaves    the containers to rosbag1_index, rosbag2_sqlite and mcap_file, what messages mean to ros_opening.
+Owns      recognising them, and which files are one recording.
+Leaves    metadata.yaml to rosbag2_metadata, the containers to rosbag1_index, rosbag2_sqlite and mcap_file, what
+          messages mean to ros_opening.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import yaml
 from loguru import logger
 
 from aruco.errors import InputError
@@ -21,14 +20,12 @@ from aruco.model import Recording
 from rigcal.sources.message_store import ChannelStore, MessageStore, SplitStore, Topic, ZstdMessages, plain_type
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.rosbag1_index import MAGIC, Rosbag1Index
+from rigcal.sources.rosbag2_metadata import METADATA, read_metadata
 from rigcal.sources.rosbag2_sqlite import SIGNATURE, SqliteStore
 
 if TYPE_CHECKING:
     from rigcal.sources.mcap_file import McapStore
 
-METADATA = "metadata.yaml"
-# A line for each of some thousand files, and some lines for each of some hundred topics.
-MAX_METADATA_BYTES = 4 * 2**20
 # Messages that wait to be written when a file is full come into the next.
 OVERLAP_NS = 1_000_000_000
 # Files of a split bag: <name>_0.db3, <name>_1.db3, ...
@@ -41,7 +38,7 @@ def recognises(path: Path, head: bytes) -> bool:
         # Any version: what is too old is named when it is opened. Of SQLite files those with rosbag2's table.
         return head.startswith(b"#ROSBAG V") or (head.startswith(SIGNATURE) and b"TABLE topics" in head)
     try:
-        return path.is_dir() and bool(_metadata(path).files or _files(path))
+        return path.is_dir() and bool(read_metadata(path).files or _files(path))
     except (OSError, InputError):
         # What is wrong with a metadata.yaml is said when it is opened.
         return (path / METADATA).is_file()
@@ -83,19 +80,10 @@ class BagStore(ChannelStore):
         }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Metadata:
-    """What metadata.yaml says."""
-
-    files: tuple[str, ...] = ()
-    compression_mode: str = ""  # "", "file" or "message"
-    compression_format: str = ""
-
-
 def _store(path: Path) -> MessageStore:
     if not path.is_dir():
         return _file_store(path)
-    metadata = _metadata(path)
+    metadata = read_metadata(path)
     files = _files(path)
     if not files:
         raise InputError(f"{path}: no bag there; a rosbag2 folder has {METADATA} and .db3 or .mcap files.")
@@ -132,7 +120,7 @@ def _files(path: Path) -> list[Path]:
 
     An interrupted recorder has written no metadata.yaml; then the files are known by their numbered names.
     """
-    metadata = _metadata(path)
+    metadata = read_metadata(path)
     if metadata.files:
         # Only names: a bag's files lie beside its metadata, whatever the paths say.
         found = [path / PurePath(name).name for name in metadata.files]
@@ -163,32 +151,3 @@ def _are_split(files: Sequence[Path]) -> bool:
     spans = [span for store in stores if (span := store.span_ns()) is not None]
     overlap_ns = min([OVERLAP_NS, *((end - start) // 2 for start, end in spans)])
     return all(later[0] >= earlier[1] - overlap_ns for earlier, later in pairwise(spans))
-
-
-def _metadata(path: Path) -> _Metadata:
-    file = path / METADATA
-    if not file.is_file():
-        return _Metadata()
-    if file.stat().st_size > MAX_METADATA_BYTES:
-        raise InputError(f"{file}: over {MAX_METADATA_BYTES >> 20} MiB, which is not a rosbag2 description.")
-    try:
-        # The base loader makes texts, lists and maps only.
-        content = yaml.load(file.read_text(encoding="utf-8-sig"), Loader=yaml.BaseLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{file}: not a readable YAML file ({reason}); restore it or run ros2 bag reindex.") from error
-    bag = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
-    if not isinstance(bag, dict):
-        return _Metadata()  # another program's
-    return _Metadata(
-        files=tuple(
-            name for name in _list(bag, "relative_file_paths") if isinstance(name, str) and PurePath(name).name
-        ),
-        compression_mode=str(bag.get("compression_mode", "")).lower().replace("none", ""),
-        compression_format=str(bag.get("compression_format", "")).lower(),
-    )
-
-
-def _list(content: Mapping[str, Any], key: str) -> list[Any]:
-    value = content.get(key)
-    return value if isinstance(value, list) else []

@@ -52,8 +52,8 @@ def camera_of(info: CameraInfo, name: str, *, is_rectified: bool, size: tuple[in
         K, model, distortion = _square(info.K), *_lens(info, name)
     if not K[:2, :2].any():
         raise InputError(
-            f"camera {name}: its CameraInfo is empty (K is zero), so the driver did not know a calibration; calibrate "
-            "the camera and record again."
+            f"camera {name}: its CameraInfo is empty (K is zero), so the driver did not know a calibration; give its "
+            "intrinsics with --intrinsics FILE, or calibrate the camera and record again."
         )
     return Camera(
         name=name,
@@ -88,7 +88,7 @@ def _lens(info: CameraInfo, name: str) -> tuple[DistortionModel, Array]:
     if model is None:
         raise InputError(
             f"camera {name}: the distortion model {info.model[:40]!r} is not known; known: {', '.join(COEFFICIENTS)}; "
-            "record rectified images."
+            "record rectified images, or give --intrinsics FILE."
         )
     distortion = info.D
     if model == "equidistant" and len(distortion) > 4 and not distortion[4:].any():
@@ -104,7 +104,7 @@ def _of_size(info: CameraInfo, name: str, size: tuple[int, int] | None) -> Camer
     if (bx, by, left, top) == (1, 1, 0, 0) or size[0] * bx + left > info.width or size[1] * by + top > info.height:
         raise InputError(
             f"camera {name}: images are {size[0]} x {size[1]}, but its CameraInfo says {info.width} x {info.height}; "
-            "name the CameraInfo that belongs to the images with --topics, or record it."
+            "name the CameraInfo that belongs to the images with --topics, or give --intrinsics FILE."
         )
     # As ROS's image_geometry: the region is cut out of the full image, then binned.
     shrink, shift = np.diag([1 / bx, 1 / by, 1.0]), np.array([[1.0, 0, -left], [0, 1, -top], [0, 0, 1]])

@@ -1,14 +1,15 @@
 """Opening a recording of ROS messages: its cameras, their intrinsics, and the stamps of all messages that are used.
 
-Owns      the order of steps, and what to say when there is no camera.
-Leaves    pairing topics to ros_topics and realsense_topics, CameraInfo to ros_cameras, frames to ros_recording.
+Owns      the order of steps, whose intrinsics count, and what to say when there is no camera.
+Leaves    pairing topics to ros_topics, realsense_topics and rigcal_topics, messages that are read for it to
+          ros_samples, CameraInfo to ros_cameras, frames to ros_recording.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from functools import cached_property
 
 import numpy as np
 from loguru import logger
@@ -18,20 +19,17 @@ from aruco.errors import InputError, OutputError
 from aruco.model import Camera
 from aruco.svo_sync import MAX_STAMP_NS
 from rigcal.sources.decompression import DamagedError
+from rigcal.sources.given_cameras import fitting, listed, meant
 from rigcal.sources.message_store import MessageStore
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.realsense_topics import is_realsense, realsense_cameras, with_depth_unit
 from rigcal.sources.rgbd_writer import refuse_unusable_name
+from rigcal.sources.rigcal_topics import is_rigcals, rigcal_cameras, with_layout
 from rigcal.sources.ros_cameras import baseline_of, camera_of
-from rigcal.sources.ros_images import image_pixels
-from rigcal.sources.ros_messages import HEAD_BYTES, CameraInfo, RawImage, read_camera_info, read_header
-from rigcal.sources.ros_recording import CameraSource, RosRecording, Stamped, parsed_image
-from rigcal.sources.ros_topics import CameraTopics, First, listing, paired
-from rigcal.sources.topic_names import INFO
-
-_T = TypeVar("_T")
-# Of a topic whose messages are all alike, spread over the recording: where one is damaged its neighbours may be.
-TRIED_MESSAGES = 10
+from rigcal.sources.ros_messages import HEAD_BYTES, read_header
+from rigcal.sources.ros_recording import CameraSource, RosRecording, Stamped
+from rigcal.sources.ros_samples import Samples
+from rigcal.sources.ros_topics import CameraTopics, listing, paired
 
 
 def ros_recording(store: MessageStore, options: SourceOptions) -> RosRecording:
@@ -50,18 +48,20 @@ def ros_recording(store: MessageStore, options: SourceOptions) -> RosRecording:
 class _Opening:
     def __init__(self, store: MessageStore, options: SourceOptions) -> None:
         self._store, self._options = store, options
-        self._firsts: dict[str, First] = {}
+        self._samples = Samples(store)
 
     def recording(self) -> RosRecording:
         found = self._paired()
+        given = self._given(found)
         cameras: list[tuple[CameraTopics, Camera, Camera | None]] = []
         for topics in found:
-            camera = self._camera(topics)
+            camera = given.get(topics.name) or self._recorded_camera(topics)
             if camera is not None:
-                lens = self._depth_lens(topics, camera) if topics.depth is not None else None
+                camera = replace(camera, baseline_m=camera.baseline_m or self._baseline(topics))
+                lens = self._depth_lens(topics, camera, is_given=topics.name in given)
                 cameras.append((topics, camera, lens))
             elif len(found) > 1:
-                logger.warning("{}: {} is left out, it has no CameraInfo", self._store.path, topics.image)
+                logger.warning("{}: {} is left out, {}", self._store.path, topics.image, self._without(topics.name))
         if not cameras:
             raise self._no_camera(found)
         stamped = self._stamped([topics for topics, _, _ in cameras])
@@ -69,11 +69,16 @@ class _Opening:
 
     def _paired(self) -> Sequence[CameraTopics]:
         topics = self._store.topics
-        if not self._options.topics and is_realsense(topics):
+        if self._options.topics:
+            found = paired(topics, self._samples.first, self._options.topics)
+            found = [with_layout(topics, with_depth_unit(self._store, camera)) for camera in found]
+        elif is_realsense(topics):
             found = realsense_cameras(self._store)
+        elif is_rigcals(topics):
+            found = rigcal_cameras(topics)
         else:
-            found = paired(topics, self._first, self._options.topics)
-            found = [with_depth_unit(self._store, camera) for camera in found]
+            found = paired(topics, self._samples.first, ())
+        _refuse_same_names(found)
         for camera in found:
             try:
                 refuse_unusable_name(camera.name)
@@ -82,97 +87,90 @@ class _Opening:
             logger.debug("camera {}: {}", camera.name, camera)
         return found
 
-    def _first(self, topic: str) -> First:
-        """What a topic's first message tells; nothing where it is damaged."""
-        if topic not in self._firsts:
-            try:
-                self._firsts[topic] = self._read_first(topic)
-            except DamagedError as error:
-                logger.debug("{}: the first message of {} {}", self._store.path, topic, error)
-                self._firsts[topic] = First()
-        return self._firsts[topic]
+    def _given(self, found: Sequence[CameraTopics]) -> Mapping[str, Camera]:
+        """The cameras of the recording that the user gives intrinsics of.
 
-    def _read_first(self, topic: str) -> First:
-        if self._store.topics[topic].type == INFO:
-            info = self._info(topic)
-            return First(frame_id=info.header.frame_id, eyes_apart=baseline_of(info) is not None)
-        message = self._whole(topic, lambda data: parsed_image(data, self._store, topic))
-        frame_id = message.header.frame_id
-        if isinstance(message, RawImage):
-            return First(encoding=message.encoding, frame_id=frame_id, size=(message.width, message.height))
-        return First(encoding=message.format, frame_id=frame_id)
+        Raises:
+            InputError: They are of images of another size.
+        """
+        file, known = self._options.intrinsics, self._known
+        if file is None:
+            return {}
+        is_only = self._options.is_only and len(found) == 1
+        cameras: dict[str, Camera] = {}
+        for topics in found:
+            camera = meant(known, topics.name, only=is_only)
+            if camera is not None:
+                camera = fitting(camera, file, topics.image, self._samples.size(topics.image))
+                cameras[topics.name] = replace(camera, name=topics.name)
+        if instead := [topics.name for topics in found if topics.name in cameras and topics.info is not None]:
+            logger.info("{}: intrinsics of {} are used instead of CameraInfo", file, ", ".join(instead))
+        if not cameras and any(topics.info for topics in found):
+            # With others beside it the file may be meant for these.
+            tell = logger.warning if self._options.is_only else logger.info
+            names = ", ".join(topics.name for topics in found)
+            tell("{}: has intrinsics of {}, none of {}, whose CameraInfo is used", file, listed(known), names)
+        return cameras
 
-    def _info(self, topic: str, *, last: bool = False) -> CameraInfo:
-        encoding = self._store.topics[topic].encoding
-        return self._whole(topic, lambda data: read_camera_info(data, encoding), last=last)
+    @cached_property
+    def _known(self) -> Mapping[str, Camera]:
+        """What the user's file of intrinsics holds."""
+        file = self._options.intrinsics
+        if file is None:
+            return {}
+        try:
+            return self._options.read_cameras(file)
+        except InputError as error:
+            if self._options.is_only or not file.is_dir():
+                raise
+            # It may hold those of the videos that are read beside this recording.
+            logger.debug("{}: {}", self._store.path, error)
+            return {}
 
-    def _whole(self, topic: str, read: Callable[[bytes], _T], *, last: bool = False) -> _T:
-        """The first of a topic's messages that can be read, or the last, of some that are tried."""
-        numbers = np.unique(np.linspace(0, self._store.topics[topic].count - 1, TRIED_MESSAGES).astype(int)).tolist()
-        damage = DamagedError("is not there")
-        for number in numbers[::-1] if last else numbers:
-            try:
-                return read(self._store.message(topic, number))
-            except DamagedError as error:
-                damage = error
-        raise damage
-
-    def _camera(self, topics: CameraTopics) -> Camera | None:
-        """The camera of its CameraInfo or of the file that the user names; None: neither is there."""
+    def _recorded_camera(self, topics: CameraTopics) -> Camera | None:
+        """The camera of its CameraInfo; None: there is none."""
         if topics.info is None:
-            file = self._options.intrinsics
-            return None if file is None else self._options.read_cameras(file).get(topics.name)
-        info = self._only_info(topics.name, topics.info)
-        camera = camera_of(info, topics.name, is_rectified=topics.is_rectified, size=self._size(topics.image))
-        return replace(camera, baseline_m=self._baseline(topics))
+            return None
+        info = self._samples.info(topics.name, topics.info)
+        return camera_of(info, topics.name, is_rectified=topics.is_rectified, size=self._samples.size(topics.image))
 
     def _baseline(self, topics: CameraTopics) -> float | None:
         if topics.baseline_m is not None or topics.right_info is None:
             return topics.baseline_m
-        return baseline_of(self._info(topics.right_info))  # was read before
+        return baseline_of(self._samples.info(topics.name, topics.right_info))
 
-    def _depth_lens(self, topics: CameraTopics, camera: Camera) -> Camera | None:
+    def _depth_lens(self, topics: CameraTopics, camera: Camera, *, is_given: bool) -> Camera | None:
         """The camera of the depth images; without a CameraInfo of their own they are pixel by pixel the image's."""
-        if topics.depth_info is None:
+        if topics.depth is None or topics.depth_info is None:
             return camera
         try:
-            info = self._only_info(topics.name, topics.depth_info)
+            info = self._samples.info(topics.name, topics.depth_info)
             return camera_of(info, topics.name, is_rectified=topics.depth_is_rectified, size=None)
         except InputError as error:
+            if is_given and self._samples.first(topics.depth).size == (camera.width, camera.height):
+                return camera
             logger.warning("{}: depth {} is left out: {}", self._store.path, topics.depth, error)
             return None
 
-    def _only_info(self, name: str, topic: str) -> CameraInfo:
-        """The first CameraInfo; whether the last still says the same is told."""
-        count = self._store.topics[topic].count
-        try:
-            first = self._info(topic)
-            if count > 1 and not first.same_lens(self._info(topic, last=True)):
-                logger.warning("camera {}: {} changes during the recording; the first is used", name, topic)
-        except DamagedError as error:
-            raise InputError(
-                f"camera {name}: every message of {topic} that was tried {error}; record again."
-            ) from error
-        return first
-
-    def _size(self, topic: str) -> tuple[int, int] | None:
-        """(width, height) of a topic's first image; None where it cannot be read."""
-        first = self._first(topic)
-        if first.size is not None:
-            return first.size
-        try:
-            pixels = self._whole(topic, lambda data: image_pixels(parsed_image(data, self._store, topic)))
-        except DamagedError:
-            return None
-        return pixels.shape[1], pixels.shape[0]
+    def _without(self, camera: str) -> str:
+        """Why a camera has no intrinsics."""
+        file = self._options.intrinsics
+        there = "" if file is None else f", and {file} has intrinsics of {listed(self._known)}, not of {camera}"
+        return f"it has no CameraInfo{there}"
 
     def _no_camera(self, found: Sequence[CameraTopics]) -> InputError:
         topics = listing(self._store.topics)
         if not found:
             return InputError(f"holds no images that are read; its topics: {topics}.")
+        images, names = ", ".join(camera.image for camera in found), ", ".join(camera.name for camera in found)
+        if (file := self._options.intrinsics) is not None:
+            return InputError(
+                f"no CameraInfo beside {images}, and {file} has intrinsics of {listed(self._known)}, not of {names}; "
+                f"call its cameras so, or name the images with --topics NAME=IMAGE; its topics: {topics}."
+            )
         return InputError(
-            f"no CameraInfo beside {', '.join(camera.image for camera in found)}; record the camera_info topics too, "
-            f"name them with --topics NAME=IMAGE,CAMERA_INFO, or give --intrinsics; its topics: {topics}."
+            f"no CameraInfo beside {images}; record the camera_info topics too, name them with --topics "
+            f"NAME=IMAGE,CAMERA_INFO, or give --intrinsics FILE with {names}; its topics: {topics}."
         )
 
     def _stamped(self, found: Sequence[CameraTopics]) -> Mapping[str, Stamped]:
@@ -192,6 +190,15 @@ class _Opening:
         if lost:
             logger.warning("{}: {} messages are damaged and left out", self._store.path, lost)
         return {topic: _by_stamp(topic, np.array(rows[topic], dtype=np.int64).reshape(-1, 3)) for topic in topics}
+
+
+def _refuse_same_names(found: Sequence[CameraTopics]) -> None:
+    for camera in found:
+        same = [other.image for other in found if other.name == camera.name]
+        if len(same) > 1:
+            raise InputError(
+                f"camera {camera.name} is both {' and '.join(same)}; name them with --topics NAME=IMAGE_TOPIC."
+            )
 
 
 def _source(topics: CameraTopics, camera: Camera, lens: Camera | None, stamped: Mapping[str, Stamped]) -> CameraSource:

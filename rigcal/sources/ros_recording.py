@@ -90,7 +90,7 @@ class RosRecording:
         try:
             data = self._store.message(topic, int(source.image.numbers[index]))
             image = image_pixels(parsed_image(data, self._store, topic))
-            _check_size(image, (camera.width, camera.height))
+            _check_size(image, (camera.width, camera.height), "the intrinsics are of")
             number = self._depth[camera.name][index]
             if with_depth and source.depth is not None and number >= 0:
                 topic = source.depth.topic
@@ -99,7 +99,7 @@ class RosRecording:
             if depth_m is not None and source.confidence is not None and number >= 0:
                 topic = source.confidence.topic
                 confidence = confidence_percent(self._image(topic, int(number)))
-                _check_size(confidence, depth_m.shape[::-1])
+                _check_size(confidence, depth_m.shape[::-1], "depth is")
         except DamagedError as error:
             reason = f"a message of {topic} {error}"
             logger.debug("skipped: {}", reason)
@@ -119,7 +119,7 @@ class RosRecording:
     def _depth_of(self, source: CameraSource, topic: str, number: int) -> NDArray[np.float32]:
         depth_m = depth_metres(self._image(topic, number), source.camera.depth_scale)
         lens = source.depth_lens or source.camera
-        _check_size(depth_m, (lens.width, lens.height))
+        _check_size(depth_m, (lens.width, lens.height), "the intrinsics are of")
         return _straightened(depth_m, lens) if lens.has_distortion else depth_m
 
 
@@ -133,17 +133,15 @@ def _numbers(stamped: Stamped | None, images: Stamped) -> NDArray[np.int64]:
     return np.full(len(images.stamps_ns), -1, dtype=np.int64) if stamped is None else stamped.number_of(images)
 
 
-def _check_size(image: NDArray[np.generic], size: tuple[int, ...]) -> None:
+def _check_size(image: NDArray[np.generic], size: tuple[int, ...], what: str) -> None:
     if image.shape[1::-1] != size:
-        raise DamagedError(f"is {image.shape[1]} x {image.shape[0]}, but the CameraInfo says {size[0]} x {size[1]}")
+        raise DamagedError(f"is {image.shape[1]} x {image.shape[0]}, but {what} {size[0]} x {size[1]}")
 
 
 def _straightened(depth_m: NDArray[np.float32], lens: Camera) -> NDArray[np.float32]:
     """Depth of a distorted image as a pinhole with the same K has it; no value is mixed from two."""
     height, width = depth_m.shape
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    recorded = bend(lens, np.stack([columns.ravel(), rows.ravel()], axis=1)).astype(np.float32)
-    recorded = np.nan_to_num(recorded, nan=-1.0).reshape(height, width, 2)
-    straight = np.empty_like(depth_m)
-    cv2.remap(depth_m, recorded, np.empty(0), cv2.INTER_NEAREST, dst=straight, borderValue=(float("nan"),) * 4)
-    return straight
+    recorded = np.nan_to_num(bend(lens, np.stack([columns.ravel(), rows.ravel()], axis=1)), nan=-1.0)
+    x, y = recorded.astype(np.float32).T.reshape(2, height, width)
+    return cv2.remap(depth_m, x, y, cv2.INTER_NEAREST, borderValue=(float("nan"),) * 4).astype(np.float32, copy=False)

@@ -1,58 +1,32 @@
 """Which topics of a ROS recording belong to which camera.
 
 Owns      what is chosen where there is a choice, and ``--topics``.
-Leaves    the words in names to topic_names, reading messages to ros_opening, RealSense's own files to realsense_topics.
+Leaves    topics as streams to ros_streams, reading messages to ros_opening, RealSense's own files to realsense_topics,
+          rigcal's to rigcal_topics.
 
 A camera is a namespace: ``/zed/zed_node/left/image_rect_color`` is the stream ``left`` of ``/zed/zed_node``. Of its
 streams one is taken, in this order: with a camera_info before without; colour (``color``, ``rgb``), left, no stream
 named, grey, infrared, right; rectified before raw images; colour before grey; messages as they are before compressed
-ones. Left and right are two cameras where no camera_info calls them the two eyes of one. Depth is taken in the image's
-frame only.
+ones. Left and right are two cameras where no camera_info calls them the two eyes of one; so are they and colour, and
+streams of one kind, where each has a frame and a camera_info of its own. Depth is taken in the image's frame only.
 """
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from loguru import logger
 
 from aruco.errors import InputError
-from rigcal.sources.message_store import READABLE, Topic
-from rigcal.sources.topic_names import (
-    COMPRESSED,
-    GREY,
-    IMAGE,
-    INFO,
-    NO_DEPTH,
-    TRANSPORTS,
-    base_of,
-    camera_name,
-    is_depth_topic,
-    is_rectified,
-    namespace_of,
-    side_of,
-)
-
-# What rigcal writes into the metadata of an MCAP channel; see mcap_writer.
-NAME_KEY, BASELINE_KEY = "rigcal.camera", "rigcal.baseline_m"
+from rigcal.sources.message_store import Topic
+from rigcal.sources.ros_streams import First, Peek, Stream, Streams
+from rigcal.sources.topic_names import COMPRESSED, GREY, IMAGE, INFO, NO_DEPTH, TRANSPORTS, camera_name
 
 _MAX_LISTED = 40
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class First:
-    """What a topic's first message tells."""
-
-    encoding: str = ""  # of an Image, or the format of a CompressedImage
-    frame_id: str = ""
-    size: tuple[int, int] | None = None  # (width, height)
-    eyes_apart: bool = False  # of a CameraInfo: of a second eye (P[0, 3] is not 0)
-
-
-Peek = Callable[[str], First]
+# The last part of the name of the only confidence whose meaning is known besides rigcal's own.
+_ZED_CONFIDENCE = "confidence_map"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,21 +46,6 @@ class CameraTopics:
     right_info: str | None = None  # of the other eye, whose P holds the baseline
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Stream:
-    """An image topic, whatever ways of transport it was recorded in."""
-
-    namespace: str
-    kind: int  # index into topic_names.STREAMS
-    base: str  # without the transport
-    topic: str
-    info: str | None
-
-    @property
-    def is_rectified(self) -> bool:
-        return is_rectified(self.base)
-
-
 def paired(topics: Mapping[str, Topic], peek: Peek, given: Sequence[str]) -> tuple[CameraTopics, ...]:
     """The cameras of a recording.
 
@@ -96,27 +55,21 @@ def paired(topics: Mapping[str, Topic], peek: Peek, given: Sequence[str]) -> tup
         given: What the user says, "<camera>=<image>[,<camera info>[,<depth>]]" each; empty: found by name.
 
     Returns:
-        The cameras, sorted by name.
+        The cameras, sorted by name; two may have one name.
 
     Raises:
-        InputError: There is none, two have one name, or a topic that is given is not there.
+        InputError: There is none, or a topic that is given is not there.
     """
-    readable = {name: topic for name, topic in topics.items() if topic.count and topic.encoding in READABLE}
-    streams, depths = _sorted_out(readable, peek)
+    streams = Streams(topics, peek)
     if given:
-        cameras = [_given(words, topics, readable, depths, peek) for words in given]
+        cameras = [_given(words, streams) for words in given]
     else:
-        groups: dict[str, list[_Stream]] = {}
-        for stream in streams:
+        groups: dict[str, list[Stream]] = {}
+        for stream in streams.images:
             groups.setdefault(stream.namespace, []).append(stream)
-        cameras = [camera for group in groups.values() for camera in _of_namespace(group, readable, depths, peek)]
+        cameras = [camera for group in groups.values() for camera in _of_namespace(group, streams)]
     if not cameras:
         raise InputError(f"holds no images that are read; its topics: {listing(topics)}.")
-    names = [camera.name for camera in cameras]
-    for camera in cameras:
-        if names.count(camera.name) > 1:
-            same = " and ".join(other.image for other in cameras if other.name == camera.name)
-            raise InputError(f"camera {camera.name} is both {same}; name them with --topics NAME=IMAGE_TOPIC.")
     return tuple(sorted(cameras, key=lambda camera: camera.name))
 
 
@@ -128,84 +81,76 @@ def listing(topics: Mapping[str, Topic]) -> str:
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "") if topics else "none"
 
 
-def _sorted_out(readable: Mapping[str, Topic], peek: Peek) -> tuple[list[_Stream], list[_Stream]]:
-    """(images, depth and what goes with it), sorted by name; one stream for each way of transport is enough."""
-    found: dict[str, list[str]] = {}
-    for name, topic in sorted(readable.items()):
-        if topic.type in (IMAGE, COMPRESSED):
-            found.setdefault(base_of(topic), []).append(name)
-    images, depths = [], []
-    for base, names in sorted(found.items()):
-        # As they are before compressed; depth that was compressed like a picture is worthless.
-        names.sort(key=lambda name: (readable[name].type != IMAGE, not name.endswith("compressedDepth"), name))
-        namespace, kind = namespace_of(base)
-        stream = _Stream(namespace=namespace, kind=kind, base=base, topic=names[0], info=_info_of(base, readable))
-        if is_depth_topic(base, peek(names[0]).encoding):
-            depths.append(stream)
-        else:
-            pictures = [name for name in names if not name.endswith("compressedDepth")]
-            images += [replace(stream, topic=name) for name in pictures[:1]]
-    return images, depths
-
-
-def _info_of(base: str, readable: Mapping[str, Topic]) -> str | None:
-    """The camera_info beside an image, where image_transport puts it, or below it."""
-    for name in (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info"):
-        if name in readable and readable[name].type == INFO:
-            return name
-    return None
-
-
-def _of_namespace(
-    streams: Sequence[_Stream], readable: Mapping[str, Topic], depths: Sequence[_Stream], peek: Peek
-) -> list[CameraTopics]:
+def _of_namespace(group: Sequence[Stream], streams: Streams) -> list[CameraTopics]:
     ranked = sorted(
-        streams,
-        key=lambda one: (one.info is None, one.kind, not one.is_rectified, bool(GREY.search(one.base)), one.base),
+        group,
+        key=lambda one: (one.info is None, one.kind, not one.is_rectified, bool(GREY.search(one.name)), one.base),
     )
-    best = ranked[0]
-    name = readable[best.topic].about.get(NAME_KEY) or camera_name(best.namespace)
-    eyes = [one for one in ranked if side_of(one.kind) == "right"]
-    right = eyes[0] if eyes and side_of(best.kind) == "left" else None
-    if right is not None and not (right.info and peek(right.info).eyes_apart):
-        chosen = [_camera(f"{name}_left".strip("_"), best, readable, depths, peek)]
-        chosen.append(_camera(f"{name}_right".strip("_"), right, readable, depths, peek))
-    else:
-        chosen = [_camera(name or side_of(best.kind) or "camera", best, readable, depths, peek)]
-    left_out = [one.base for one in ranked if one.topic not in [camera.image for camera in chosen]]
-    if left_out:
-        taken = " and ".join(camera.image for camera in chosen)
-        logger.info("of one camera's images {} is taken, not {} (--topics chooses)", taken, ", ".join(left_out))
-    return chosen
+    has_eyes = any(one.side == "right" and one.info and streams.peek(one.info).eyes_apart for one in group)
+    taken = ranked[:1]
+    for one in ranked[1:]:
+        if not (has_eyes and one.side == "right") and _is_another(one, taken, streams.peek):
+            taken.append(one)
+    _tell_left_out([one for one in ranked if one not in taken], taken, streams.peek)
+    return [_camera(name, one, streams) for name, one in zip(_names(taken), taken)]
 
 
-def _camera(
-    name: str, image: _Stream, readable: Mapping[str, Topic], depths: Sequence[_Stream], peek: Peek
-) -> CameraTopics:
+def _is_another(one: Stream, taken: Sequence[Stream], peek: Peek) -> bool:
+    """Whether a stream is another camera's than those that are taken."""
+    sides = [other.side for other in taken]
+    if one.side == "right" and "left" in sides and "right" not in sides:
+        return True
+    has_own_info = one.info is not None and one.info not in [other.info for other in taken]
+    # Infrared and grey images beside colour are of one device.
+    is_alike = bool(one.side) or one.kind == taken[0].kind
+    return is_alike and has_own_info and _is_elsewhere(one, taken, peek)
+
+
+def _is_elsewhere(one: Stream, taken: Sequence[Stream], peek: Peek) -> bool:
+    """Whether a stream is in no frame of those that are taken, nor computed from another."""
+    frame, frames = peek(one.topic).frame_id, [peek(other.topic).frame_id for other in taken]
+    return bool(frame) and all(frames) and frame not in frames and "_to_" not in one.name
+
+
+def _names(taken: Sequence[Stream]) -> list[str]:
+    """What the cameras of one namespace are called."""
+    name, sides = camera_name(taken[0].namespace), [one.side for one in taken]
+    if len(taken) == 1:
+        return [name or sides[0] or "camera"]
+    if sides == ["left", "right"]:
+        return [f"{name}_{side}".strip("_") for side in sides]
+    return [camera_name((one.info or one.base).rpartition("/")[0]) or "camera" for one in taken]
+
+
+def _tell_left_out(left_out: Sequence[Stream], taken: Sequence[Stream], peek: Peek) -> None:
+    images = " and ".join(one.topic for one in taken)
+    # A device has a namespace: what has none may be cameras that are called like streams.
+    unclear = [one for one in left_out if not one.namespace and _is_elsewhere(one, taken, peek)]
+    if unclear:
+        logger.warning(
+            "{} are taken for other images of the camera of {} and left out; where they are cameras name all with "
+            "--topics NAME=IMAGE_TOPIC",
+            ", ".join(one.base for one in unclear),
+            images,
+        )
+    if known := [one.base for one in left_out if one not in unclear]:
+        logger.info("of one camera's images {} is taken, not {} (--topics chooses)", images, ", ".join(known))
+
+
+def _camera(name: str, image: Stream, streams: Streams, *, but_depth: bool = False) -> CameraTopics:
     camera = CameraTopics(
         name=name,
         image=image.topic,
         info=image.info,
         is_rectified=image.is_rectified,
-        baseline_m=_positive(readable[image.topic].about.get(BASELINE_KEY, "")),
-        right_info=_right_info(image.namespace, readable, peek),
+        right_info=streams.right_info(image.namespace),
     )
-    mine = [one for one in depths if one.namespace == image.namespace]
-    confidence = next((one.topic for one in mine if "confidence" in one.base), None)
-    return _with_depth(
-        replace(camera, confidence=confidence), [one for one in mine if not NO_DEPTH.search(one.base)], peek
-    )
+    mine = [] if but_depth else [one for one in streams.depths if one.namespace == image.namespace]
+    camera = _with_depth(camera, [one for one in mine if not NO_DEPTH.search(one.name)], streams.peek)
+    return _with_confidence(camera, [one for one in mine if "confidence" in one.name], streams.peek)
 
 
-def _positive(word: str) -> float | None:
-    try:
-        value = float(word)
-    except ValueError:
-        return None
-    return value if 0 < value < math.inf else None
-
-
-def _with_depth(camera: CameraTopics, depths: Sequence[_Stream], peek: Peek) -> CameraTopics:
+def _with_depth(camera: CameraTopics, depths: Sequence[Stream], peek: Peek) -> CameraTopics:
     """With the depth that lies in the image's frame; what is left out is told."""
     if not depths:
         return camera
@@ -221,60 +166,68 @@ def _with_depth(camera: CameraTopics, depths: Sequence[_Stream], peek: Peek) -> 
             why,
         )
         return camera
-    best = min(usable, key=lambda one: (not re.search("aligned|_to_|registered", one.base), one.base))
+    best = min(usable, key=lambda one: (not re.search("aligned|_to_|registered", one.name), one.base))
     return replace(camera, depth=best.topic, depth_info=best.info, depth_is_rectified=best.is_rectified)
+
+
+def _with_confidence(camera: CameraTopics, found: Sequence[Stream], peek: Peek) -> CameraTopics:
+    """With the ZED's confidence of the depth; other programs' numbers mean something else."""
+    if camera.depth is None or not found:
+        return camera
+    depth = peek(camera.depth)
+    for one in found:
+        first = peek(one.topic)
+        is_of_depth = _may_have_one_size(depth, first) and first.frame_id == depth.frame_id
+        if is_of_depth and one.base.endswith(f"/{_ZED_CONFIDENCE}"):
+            return replace(camera, confidence=one.topic)
+    logger.warning(
+        "camera {}: confidence {} is left out: only the ZED driver's is known ({}, of depth's frame and size)",
+        camera.name,
+        ", ".join(one.base for one in found),
+        _ZED_CONFIDENCE,
+    )
+    return camera
 
 
 def _may_have_one_size(image: First, depth: First) -> bool:
     return image.size is None or depth.size is None or image.size == depth.size
 
 
-def _is_aligned(depth: _Stream, image_topic: str, image: First, first: First) -> bool:
+def _is_aligned(depth: Stream, image_topic: str, image: First, first: First) -> bool:
     if image.frame_id and first.frame_id:
         return image.frame_id == first.frame_id
     # Nobody has said which frame; then the name must.
     named = [f"depth_to_{part}" for part in image_topic.split("/") if part]
-    return "registered" in depth.base or any(
+    return "registered" in depth.name or any(
         name in depth.base.split("/") or f"aligned_{name}" in depth.base for name in named
     )
 
 
-def _right_info(namespace: str, readable: Mapping[str, Topic], peek: Peek) -> str | None:
-    for name, topic in sorted(readable.items()):
-        if topic.type == INFO and namespace_of(name)[0] == namespace and peek(name).eyes_apart:
-            return name
-    return None
-
-
-def _given(
-    words: str, topics: Mapping[str, Topic], readable: Mapping[str, Topic], depths: Sequence[_Stream], peek: Peek
-) -> CameraTopics:
+def _given(words: str, streams: Streams) -> CameraTopics:
     """A camera as the user names its topics."""
     name, sign, rest = words.partition("=")
     parts = [part.strip() for part in rest.split(",")]
     if not sign or not name or not parts[0] or len(parts) > 3:
         raise InputError(f"--topics {words}: want <camera>=<image topic>[,<camera info topic>[,<depth topic>]].")
-    image = _there(parts[0], (IMAGE, COMPRESSED), topics, readable)
-    base = base_of(readable[image])
-    info = _there(parts[1], (INFO,), topics, readable) if len(parts) > 1 and parts[1] else _info_of(base, readable)
-    namespace, kind = namespace_of(base)
-    stream = _Stream(namespace=namespace, kind=kind, base=base, topic=image, info=info)
-    camera = _camera(name, stream, readable, depths if len(parts) < 3 else (), peek)
+    image = _there(parts[0], (IMAGE, COMPRESSED), streams)
+    info = _there(parts[1], (INFO,), streams) if len(parts) > 1 and parts[1] else None
+    camera = _camera(name, streams.of(image, info), streams, but_depth=len(parts) == 3)
     if len(parts) < 3 or not parts[2]:
         return camera
-    depth = _there(parts[2], (IMAGE, COMPRESSED), topics, readable)
-    base = base_of(readable[depth])
-    frames = [peek(topic).frame_id for topic in (image, depth)]
+    depth = streams.of(_there(parts[2], (IMAGE, COMPRESSED), streams))
+    frames = [streams.peek(topic).frame_id for topic in (image, depth.topic)]
     if all(frames) and frames[0] != frames[1]:
         logger.warning(
-            "camera {}: depth {} is in frame {}, the image in {}; taken as named", name, depth, *frames[::-1]
+            "camera {}: depth {} is in frame {}, the image in {}; taken as named", name, depth.topic, *frames[::-1]
         )
-    return replace(camera, depth=depth, depth_info=_info_of(base, readable), depth_is_rectified=is_rectified(base))
+    return replace(camera, depth=depth.topic, depth_info=depth.info, depth_is_rectified=depth.is_rectified)
 
 
-def _there(name: str, types: Sequence[str], topics: Mapping[str, Topic], readable: Mapping[str, Topic]) -> str:
+def _there(name: str, types: Sequence[str], streams: Streams) -> str:
     """The topic of that name, or of a way of its transport."""
     for topic in (name, *(f"{name}/{transport}" for transport in TRANSPORTS)):
-        if topic in readable and readable[topic].type in types:
+        if topic in streams.readable and streams.readable[topic].type in types:
             return topic
-    raise InputError(f"--topics: {name} is no {' or '.join(types)} with messages here; its topics: {listing(topics)}.")
+    raise InputError(
+        f"--topics: {name} is no {' or '.join(types)} with messages here; its topics: {listing(streams.topics)}."
+    )

@@ -16,10 +16,12 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+from loguru import logger
 
 from aruco.errors import InputError
-from rigcal.sources.chunked_file import NO_CHUNK, Chunk, ChunkedFile, IndexBuilder, Read, reader
-from rigcal.sources.decompression import MAX_CHUNK_BYTES, MAX_MESSAGE_BYTES, DamagedError
+from rigcal.sources.chunked_file import ChunkedFile, Read, reader
+from rigcal.sources.decompression import MAX_MESSAGE_BYTES, DamagedError
+from rigcal.sources.message_places import NO_CHUNK, Chunk, IndexBuilder
 
 MAGIC = b"#ROSBAG V2.0\n"
 # Headers hold a few numbers and a topic; a connection's data is a message definition.
@@ -48,11 +50,11 @@ class Rosbag1Index(ChunkedFile):
         """Walk through the bag; no message is read.
 
         Raises:
-            InputError: Not a bag, encrypted, damaged beyond use, or of absurd sizes.
+            InputError: Not a bag, encrypted, or of too many messages.
         """
         walk = _Walk(path)
         super().__init__(path, walk.index.chunks, _extent)
-        self.walk_through(walk, "bag")
+        self.walk_through(walk)
         self.loss: str | None = walk.loss()  # how a bag ends that is cut off: "<file> ..."
         self.connections: tuple[Connection, ...] = tuple(walk.connections[key] for key in sorted(walk.connections))
         self.places = {connection.id: walk.index.places(connection.id) for connection in self.connections}
@@ -64,9 +66,8 @@ class _Walk:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._size = 0
-        self.index = IndexBuilder()
+        self.index = IndexBuilder(path)
         self.connections: dict[int, Connection] = {}
-        self._loose: dict[int, list[tuple[int, int]]] = {}  # messages outside of chunks
         self._cut_at: int | None = None
 
     def through(self, file: IO[bytes]) -> None:
@@ -84,11 +85,13 @@ class _Walk:
             fields, data, end = record
             if _op(fields) != _INDEX:
                 self.index.settle()
-            self._note(file, at, fields, data, end)
+            try:
+                self._note(file, at, fields, data, end)
+            except DamagedError as error:
+                self.index.leave_out(f"the one at byte {at}, which {error}")
             at = end
         # The index of the last chunk can be missing whole, but then chunks follow no index and are looked into.
         self.index.settle(whole=self._cut_at is None)
-        self._add(self._loose, NO_CHUNK)
 
     def must_look_into(self, chunk: int) -> bool:
         """Whether a chunk has no index, or its index names a connection that is not known yet."""
@@ -97,15 +100,17 @@ class _Walk:
     def look_into(self, data: memoryview, chunk: int) -> None:
         """Connections, and messages where there is no index, of those records of a chunk that are whole."""
         with_messages = chunk in self.index.unindexed
-        at, found = 0, dict[int, list[tuple[int, int]]]()
+        at = 0
         while record := _record(lambda at, size: bytes(data[at : at + size]), at, len(data)):
             fields, body, end = record
-            if _op(fields) == _CONNECTION and end - body <= MAX_CONNECTION_BYTES:
-                self._connection(fields, bytes(data[body:end]))
-            elif _op(fields) == _MESSAGE and with_messages:
-                found.setdefault(_number(fields, b"conn"), []).append((_time_ns(fields), at))
+            try:
+                if _op(fields) == _CONNECTION:
+                    self._connection(fields, bytes(data[body : min(end, body + MAX_CONNECTION_BYTES)]))
+                elif _op(fields) == _MESSAGE and with_messages:
+                    self.index.add_one(_number(fields, b"conn"), _time_ns(fields), at, chunk)
+            except DamagedError as error:
+                self.index.leave_out(f"one in the chunk at byte {self.index.chunks[chunk].at}, which {error}")
             at = end
-        self._add(found, chunk)
 
     def loss(self) -> str | None:
         """How the bag ends if it is cut off; completes "<file> ..."."""
@@ -114,41 +119,51 @@ class _Walk:
     def _note(self, file: IO[bytes], at: int, fields: Mapping[bytes, bytes], data: int, end: int) -> None:
         op = _op(fields)
         if op == _BAG_HEADER and fields.get(b"encryptor"):
-            raise DamagedError(f"is encrypted ({fields[b'encryptor'][:40].decode('utf-8', 'replace')})")
+            how = fields[b"encryptor"][:40].decode("utf-8", "replace")
+            raise InputError(f"{self._path}: is encrypted ({how}); decrypt it with rosbag decrypt.")
         if op == _CHUNK:
             self._chunk(fields, data, end)
         elif op == _INDEX:
             self._index(file, fields, data, end)
-        elif op == _CONNECTION and end - data <= MAX_CONNECTION_BYTES:
-            self._connection(fields, reader(file)(data, end - data))
+        elif op == _CONNECTION:
+            self._connection(fields, reader(file)(data, min(end - data, MAX_CONNECTION_BYTES)))
         elif op == _MESSAGE:
-            self._loose.setdefault(_number(fields, b"conn"), []).append((_time_ns(fields), at))
+            self.index.add_one(_number(fields, b"conn"), _time_ns(fields), at, NO_CHUNK)
+        elif op not in (_BAG_HEADER, _CHUNK_INFO):
+            raise DamagedError("is of no known kind")
 
     def _chunk(self, fields: Mapping[bytes, bytes], data: int, end: int, *, cut: bool = False) -> None:
-        stated = _number(fields, b"size")
-        if max(stated, end - data) > MAX_CHUNK_BYTES:
-            raise DamagedError(f"the chunk at byte {data} states {max(stated, end - data)} bytes, more than 1 GiB")
-        compression = fields.get(b"compression", b"none")[:20].decode("utf-8", "replace")
-        self.index.begin_chunk(Chunk(at=data, stored=end - data, stated=stated, compression=compression, cut=cut))
+        size = fields.get(b"size", b"")
+        self.index.begin_chunk(
+            Chunk(
+                at=data,
+                stored=end - data,
+                stated=int.from_bytes(size, "little"),
+                compression=fields.get(b"compression", b"none")[:20].decode("utf-8", "replace"),
+                cut=cut,
+                damage="" if len(size) == _U32.size else "has a damaged header",
+            )
+        )
 
     def _index(self, file: IO[bytes], fields: Mapping[bytes, bytes], data: int, end: int) -> None:
-        count = _number(fields, b"count")
+        try:
+            count, connection = _number(fields, b"count"), _number(fields, b"conn")
+        except DamagedError:
+            count, connection = -1, -1
         if count * _INDEX_ENTRY.itemsize != end - data:
-            raise DamagedError(f"the index at byte {data} is damaged")
+            logger.debug("{}: the index at byte {} is damaged; its chunk is looked into", self._path, data)
+            self.index.spoil_last_index()
+            return
         entries = np.frombuffer(reader(file)(data, end - data), dtype=_INDEX_ENTRY)
         times_ns = entries["s"].astype(np.int64) * 10**9 + entries["ns"]
         found = np.stack([times_ns, entries["offset"].astype(np.int64)], axis=1)
-        self.index.index_last_chunk(_number(fields, b"conn"), found)
+        self.index.index_last_chunk(connection, found)
 
     def _connection(self, fields: Mapping[bytes, bytes], data: bytes) -> None:
         key = _number(fields, b"conn")
         topic = fields.get(b"topic", b"").decode("utf-8", "replace")
         kind = _fields(data).get(b"type", b"").decode("utf-8", "replace")
         self.connections[key] = Connection(id=key, topic=topic, type=kind)
-
-    def _add(self, found: Mapping[int, list[tuple[int, int]]], chunk: int) -> None:
-        for connection, entries in found.items():
-            self.index.add(connection, np.array(entries, dtype=np.int64), chunk)
 
     def _cut(self, file: IO[bytes], at: int) -> None:
         """The bag ends within the record here; a chunk is kept as far as it goes."""
@@ -173,7 +188,8 @@ def _record(read: Read, at: int, end: int, *, cut: bool = False) -> tuple[Mappin
     fields = _fields(read(at + 4, header))
     data = at + 8 + header
     stop = data + _U32.unpack(read(data - 4, 4))[0]
-    return None if _op(fields) == 0 or (stop > end and not cut) else (fields, data, stop)
+    # Nothing but zeros is how files end whose last blocks were never written.
+    return None if not fields or (stop > end and not cut) else (fields, data, stop)
 
 
 def _fields(header: bytes) -> dict[bytes, bytes]:
@@ -197,14 +213,14 @@ def _op(fields: Mapping[bytes, bytes]) -> int:
 def _number(fields: Mapping[bytes, bytes], name: bytes) -> int:
     value = fields.get(name, b"")
     if len(value) != _U32.size:
-        raise DamagedError(f"a record lacks {name.decode()}")
+        raise DamagedError(f"lacks its {name.decode()}")
     return _U32.unpack(value)[0]
 
 
 def _time_ns(fields: Mapping[bytes, bytes]) -> int:
     value = fields.get(b"time", b"")
     if len(value) != 8:
-        raise DamagedError("a record lacks time")
+        raise DamagedError("lacks its time")
     seconds, nanoseconds = struct.unpack("<II", value)
     return seconds * 10**9 + nanoseconds
 

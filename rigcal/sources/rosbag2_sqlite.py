@@ -1,32 +1,29 @@
 """The SQLite files of rosbag2 (.db3): messages by topic and number.
 
 Owns      tables and queries; what of a damaged file can be had.
-Leaves    metadata.yaml and split bags to ros_bag, what messages mean to ros_messages.
+Leaves    opening to sqlite_file, metadata.yaml to rosbag2_metadata, split bags to ros_bag, messages to ros_messages.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator, Sequence, Set
-from contextlib import closing
-from pathlib import Path
-from urllib.parse import quote
+from pathlib import Path, PurePath
 
 import numpy as np
 from loguru import logger
 from numpy.typing import NDArray
 
 from aruco.errors import InputError
-from rigcal.sources.chunked_file import MAX_MESSAGES
 from rigcal.sources.decompression import MAX_MESSAGE_BYTES, DamagedError
+from rigcal.sources.message_places import MAX_MESSAGES
 from rigcal.sources.message_store import Head, Topic, plain_type, span_of
+from rigcal.sources.rosbag2_metadata import Metadata, read_metadata
+from rigcal.sources.sqlite_file import DATABASE_ERRORS, SqliteFile
 from rigcal.sources.topic_names import COMPRESSED, IMAGE
 
 SIGNATURE = b"SQLite format 3\0"
-# A complaint about a damaged file may hold bytes of it that are no text.
-DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
 MAX_TOPICS = 100_000
-MAX_METADATA_CHARS = 2**24
 _ROWS = 10_000
 
 
@@ -40,8 +37,9 @@ class SqliteStore:
             InputError: It is no rosbag2 file, or damaged beyond use.
         """
         self.path = path
+        self._file = SqliteFile(path)
         try:
-            with closing(self._connected()) as base:
+            with self._file.connected() as base:
                 topics = base.execute(
                     "SELECT id, name, type, serialization_format FROM topics ORDER BY id LIMIT ?", (MAX_TOPICS,)
                 ).fetchall()
@@ -63,14 +61,14 @@ class SqliteStore:
     def message(self, topic: str, index: int) -> bytes:
         """A message's bytes; raises DamagedError where they are lost."""
         try:
-            with closing(self._connected()) as base:
+            with self._file.connected() as base:
                 return _blob(base, int(self._rows[topic][index, 0]), None)
         except DATABASE_ERRORS as error:
             raise DamagedError(f"cannot be read ({error})") from error
 
     def heads(self, topics: Sequence[str], size: int) -> Iterator[Head]:
         """The first bytes of every message of some topics; the rest of a message is not read."""
-        with closing(self._connected()) as base:
+        with self._file.connected() as base:
             for topic in topics:
                 for index, (row, log_time_ns) in enumerate(self._rows[topic].tolist()):
                     try:
@@ -83,54 +81,22 @@ class SqliteStore:
         """When the first and the last message were logged; None without messages."""
         return span_of([rows[:, 1] for rows in self._rows.values()])
 
-    def _connected(self) -> sqlite3.Connection:
-        place = f"file:{quote(str(self.path.resolve()))}?mode=ro"
-        # Without a log that was never written back where the folder cannot be written. SQLite refuses a file that is
-        # shorter than it says unless the schema is called writable, which it is not: the file is opened to be read.
-        for further, pragma in (("", "trusted_schema=OFF"), ("&immutable=1", ""), ("", "writable_schema=ON")):
-            base = sqlite3.connect(place + further, uri=True)
-            base.text_factory = lambda raw: raw.decode("utf-8", "replace")
-            try:
-                if pragma:
-                    base.execute(f"PRAGMA {pragma}")
-                base.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchall()
-            except DATABASE_ERRORS:
-                base.close()
-            else:
-                return base
-        return sqlite3.connect(place, uri=True)  # the caller says what is wrong
-
 
 def _tell_loss(path: Path, found: int, there: Set[str]) -> None:
     """Say what is used of a damaged file, and of how much where metadata.yaml beside it tells."""
-    total, counts = _stated(path)
+    try:
+        stated = read_metadata(path.parent)
+    except (OSError, InputError) as error:
+        logger.debug("{}: how much is lost is not known: {}", path, error)
+        stated = Metadata()
+    total = stated.count_of_file.get(path.name)
     of = f" of {total}" if total is not None and total >= found else ""
     logger.warning("{}: is damaged or cut off; the {}{} messages that are found are used", path, found, of)
-    if lost := sorted(name for name in counts if name not in there):
-        logger.warning("{}: nothing was found of {}", path, ", ".join(f"{name} ({counts[name]})" for name in lost))
-
-
-def _stated(path: Path) -> tuple[int | None, dict[str, int]]:
-    """(messages of a file, messages of each image topic) as metadata.yaml states them; of a split bag no topics."""
-    import yaml
-
-    try:
-        with path.with_name("metadata.yaml").open(encoding="utf-8-sig") as file:
-            # The base loader makes texts, lists and maps only.
-            bag = yaml.load(file.read(MAX_METADATA_CHARS), Loader=yaml.BaseLoader)["rosbag2_bagfile_information"]
-        counts = {Path(one["path"]).name: int(one["message_count"]) for one in bag.get("files") or ()}
-        names = {Path(name).name for name in bag["relative_file_paths"]}
-        if names != {path.name}:
-            return counts.get(path.name), {}
-        images: dict[str, int] = {}
-        for one in bag.get("topics_with_message_count") or ():
-            about = one["topic_metadata"]
-            if plain_type(about["type"]) in (IMAGE, COMPRESSED) and int(one["message_count"]) > 0:
-                images[about["name"]] = int(one["message_count"])
-        return int(bag["message_count"]), images
-    except (OSError, yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        logger.debug("{}: its metadata.yaml tells nothing: {}", path, error)
-        return None, {}
+    if tuple(PurePath(name).name for name in stated.files) != (path.name,):
+        return  # of a split bag it does not say in which file a topic is
+    images = [topic for topic in stated.topics if plain_type(topic.type) in (IMAGE, COMPRESSED) and topic.count]
+    if lost := sorted(f"{topic.name} ({topic.count})" for topic in images if topic.name not in there):
+        logger.warning("{}: nothing was found of {}", path, ", ".join(lost))
 
 
 def _all_rows(base: sqlite3.Connection) -> tuple[NDArray[np.int64], bool]:

@@ -10,6 +10,7 @@ handed out is the left eye, rectified to a pinhole camera as the SDK does it.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,13 +23,15 @@ from numpy.typing import NDArray
 from aruco.errors import InputError
 from aruco.model import BadFrame, Camera, Frame
 from aruco.pose_math import Array
+from rigcal.sources.ahead import made_ahead
 from rigcal.sources.decoding import import_av
-from rigcal.sources.mcap_index import MAGIC, DamagedError, McapIndex
+from rigcal.sources.mcap_index import DamagedError, McapIndex
+from rigcal.sources.mcap_records import MAGIC
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.svo2_frames import LOST, Row, footers, frame_index
 from rigcal.sources.svo2_header import CameraTopics, camera_topics, unreadable_coding
 from rigcal.sources.svo2_payload import Coding, Footer, FrameError, coding_of, payload_of
-from rigcal.sources.svo2_pictures import FramePictures, Pair
+from rigcal.sources.svo2_pictures import Answer, FramePictures
 from rigcal.sources.zed_conf import Rectification, factory_calibration, find_conf
 
 if TYPE_CHECKING:
@@ -38,7 +41,7 @@ SUFFIX = ".svo2"
 # The container's header names who wrote it; the first chunk, which is not compressed, the topics.
 _SIGNS = (b"libmcap stereolabs", b"svo_header", b"/side_by_side")
 
-# Frames that are asked how they are coded, should some of them be damaged.
+# Frames that are asked how they are coded, spread over the recording: where one is damaged its neighbours may be.
 _LOOKED_AT = 5
 
 
@@ -155,13 +158,14 @@ class Svo2:
         return _Source(topics=topics, camera=camera, pictures=pictures, rectification=rectification)
 
     def _coding(self, topics: CameraTopics, rows: Sequence[Row]) -> Coding:
-        """How the camera's pictures are coded, from the first frames that tell it."""
+        """How the camera's pictures are coded, from the first of some key frames that tells it."""
         sound = [message for message, row in enumerate(rows) if isinstance(row, Footer)]
         keys = [message for message in sound if cast(Footer, rows[message]).is_key]
+        asked = keys or sound
         lost = False
-        for message in (keys or sound)[:_LOOKED_AT]:
+        for at in np.unique(np.linspace(0, len(asked) - 1, _LOOKED_AT).astype(int)).tolist():
             try:
-                coding = coding_of(payload_of(self._mcap.message(topics.frames, message)))
+                coding = coding_of(payload_of(self._mcap.message(topics.frames, asked[at])))
             except (DamagedError, FrameError):
                 lost = True
                 continue
@@ -170,19 +174,18 @@ class Svo2:
                     import_av()  # here, so that somebody who lacks it hears it at once
                 return coding
         if lost:
-            raise InputError(f"{self._path}: the first frames of camera {topics.serial} are damaged; copy it again.")
+            raise InputError(f"{self._path}: the key frames of camera {topics.serial} are damaged; copy it again.")
         raise unreadable_coding(self._path, topics.serial)
 
     def _frames(self, source: _Source, indices: Sequence[int], with_depth: bool) -> Iterator[Frame | BadFrame]:
         # One for each reader: a matcher works in memory of its own, which two must not share.
         matcher = _matcher(source) if with_depth else None
-        for index, picture, digest in source.pictures.read(indices):
-            if isinstance(picture, str):
-                yield self._bad(source, index, picture)
-            else:
-                yield self._frame(source, index, picture, digest, matcher)
+        return made_ahead(lambda answer: self._frame(source, answer, matcher), source.pictures.read(indices))
 
-    def _frame(self, source: _Source, index: int, pair: Pair, digest: str, matcher: StereoMatcher | None) -> Frame:
+    def _frame(self, source: _Source, answer: Answer, matcher: StereoMatcher | None) -> Frame | BadFrame:
+        index, pair, message = answer
+        if isinstance(pair, str):
+            return self._bad(source, index, pair)
         width = source.camera.width
         left = source.rectification.left(pair[:, :width])
         depth_m = None if matcher is None else matcher.depth_m(left, source.rectification.right(pair[:, width:]))
@@ -190,7 +193,7 @@ class Svo2:
             camera=source.camera.name,
             stamp_ns=int(source.pictures.index.stamps_ns[index]),
             image=left,
-            digest=digest,
+            digest=hashlib.sha256(message).hexdigest(),
             depth_m=depth_m,
         )
 

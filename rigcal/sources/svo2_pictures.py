@@ -6,7 +6,6 @@ Leaves    the index to svo2_frames, codecs to decoding and svo2_payload, lenses 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -20,8 +19,8 @@ from rigcal.sources.svo2_frames import FrameIndex
 from rigcal.sources.svo2_payload import Coding, FrameError, jpeg_pair, payload_of
 
 Pair: TypeAlias = NDArray[np.uint8]  # (h, 2 w, 3) BGR, both eyes
-# (index of the frame, its picture or what completes "frame <n> ...", SHA-256 of its message)
-Answer: TypeAlias = tuple[int, Pair | str, str]
+# (index of the frame, its picture or what completes "frame <n> ...", its message)
+Answer: TypeAlias = tuple[int, Pair | str, bytes]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,7 +38,7 @@ class FramePictures:
         decoder = None if self.coding == "jpeg" else PacketDecoder(self.coding, size=self._pair_size)
         for run in self.index.runs(indices):
             if self.index.begins[run[0]] < 0:
-                yield run[0], self.index.faults[int(self.index.messages[run[0]])], ""
+                yield run[0], self.index.faults[int(self.index.messages[run[0]])], b""
             elif decoder is None:
                 yield from map(self._strips, run)
             else:
@@ -56,16 +55,16 @@ class FramePictures:
             message = self.mcap.message(self.channel, int(self.index.messages[index]))
             picture = jpeg_pair(payload_of(message))
         except (DamagedError, FrameError) as error:
-            return index, str(error), ""
+            return index, str(error), b""
         height, width = picture.shape[:2]
         fits = (width, height) == self._pair_size
-        return index, picture if fits else f"holds a picture of {width} x {height}", _digest(message)
+        return index, picture if fits else f"holds a picture of {width} x {height}", message
 
     def _decoded(self, run: list[int], decoder: PacketDecoder) -> Iterator[Answer]:
         """Frames of one group, which need those before them back to the key frame."""
         begin = int(self.index.begins[run[0]])
         index_of = {int(self.index.messages[index]) - begin: index for index in run}
-        digests: dict[int, str] = {}
+        messages: dict[int, bytes] = {}
 
         def packets() -> Iterator[Encoded]:
             for number in range(max(index_of) + 1):
@@ -76,13 +75,9 @@ class FramePictures:
                     yield Encoded(data=b"", key=number == 0, damage=str(error))
                     continue
                 if number in index_of:
-                    digests[number] = _digest(message)
+                    messages[number] = message
                 yield packet
 
         for number, picture in decoder.decoded(packets(), list(index_of)):
             answer = f"holds a picture that {picture.reason}" if isinstance(picture, Undecoded) else picture
-            yield index_of[number], answer, digests.pop(number, "")
-
-
-def _digest(message: bytes) -> str:
-    return hashlib.sha256(message).hexdigest()
+            yield index_of[number], answer, messages.pop(number, b"")

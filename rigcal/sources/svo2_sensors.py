@@ -50,8 +50,8 @@ def _samples(mcap: McapIndex, channel: int) -> Array:
     """(n, 3) accelerations [m/s^2], evenly over the recording."""
     step = max(1, -(-mcap.count(channel) // _MAX_SAMPLES))
     found = []
-    for part in mcap.parts([channel], _MAX_MESSAGE_BYTES):
-        if part.index % step == 0 and part.data is not None and part.total <= _MAX_MESSAGE_BYTES:
+    for part in mcap.parts([channel], _MAX_MESSAGE_BYTES, step=step):
+        if part.data is not None and part.total <= _MAX_MESSAGE_BYTES:
             found.append(_acceleration(part.data))
     return np.array([sample for sample in found if sample is not None], dtype=np.float64).reshape(-1, 3)
 

@@ -7,6 +7,7 @@ Leaves    choosing among topics to ros_topics.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Iterable
 
 from rigcal.sources.message_store import Topic
 from rigcal.sources.ros_images import is_depth
@@ -22,8 +23,12 @@ STREAMS = (
     ("", None),
     ("grey", r"mono|gr[ae]y|(left|rgb)_gr[ae]y"),
     ("infrared", r"ir|infra|infra1|infrared|infrared1|(left|ir)_(ir|left)|fisheye1?"),
-    ("right", r"right|right_(raw|rect|gr[ae]y)|infra2|infrared2|(right|ir)_(ir|right)|fisheye2"),
+    ("right", r"right|right_(raw|rect|gr[ae]y)"),
+    ("second infrared", r"infra2|infrared2|(right|ir)_(ir|right)|fisheye2"),
 )
+# What stands behind two names of streams that are one (left/color/rect/image); elsewhere the first is a namespace.
+_VERSIONS = ("rect", "raw")
+DEPTH = len(STREAMS)  # index of depth and what goes with it
 _DEPTH = re.compile(
     r"depth|depth_(to_\w+|registered|raw|rect|rect_raw|image)|aligned_depth(_to_\w+)?|[sh]w_registered|"
     r"confidence(_map)?|disparity(_image)?",
@@ -40,21 +45,47 @@ def base_of(topic: Topic) -> str:
     return head if topic.type == COMPRESSED and last in TRANSPORTS and head else topic.name
 
 
-def is_rectified(base: str) -> bool:
-    """Whether a name says that its images are rectified."""
-    return any(part == "rect" or part.startswith("image_rect") or part.endswith("_rect") for part in base.split("/"))
+def is_rectified(stream: str) -> bool:
+    """Whether a name, from the stream on, says that its images are rectified."""
+    parts = stream.strip("/").split("/")
+    if parts[-1].startswith("image_raw"):
+        return False
+    return any(part == "rect" or part.startswith("image_rect") or part.endswith("_rect") for part in parts)
 
 
-def namespace_of(base: str) -> tuple[str, int]:
-    """(the camera's namespace, index of the stream in STREAMS) of an image topic."""
+def named_like_streams(bases: Iterable[str]) -> frozenset[str]:
+    """Namespaces that are called like a stream, of image topics: left of /left/color/image_raw."""
+    found: set[str] = set()
+    for base in bases:
+        parts = base.strip("/").split("/")
+        for at, (part, inner, below) in enumerate(zip(parts, parts[1:], parts[2:])):
+            kind = _kind(part)
+            if kind is not None and kind != DEPTH and _kind(inner) is not None and below not in _VERSIONS:
+                found.add("/".join(parts[: at + 1]))
+    return frozenset(found)
+
+
+def namespace_of(base: str, namespaces: Collection[str] = ()) -> tuple[str, int]:
+    """(the camera's namespace, index of the stream in STREAMS or DEPTH) of an image topic.
+
+    Args:
+        base: Its name.
+        namespaces: What is none of its streams although it is called like one; see named_like_streams.
+    """
     parts = base.strip("/").split("/")
     for at, part in enumerate(parts):
-        for kind, (_, pattern) in enumerate(STREAMS):
-            if pattern is not None and re.fullmatch(pattern, part, re.IGNORECASE):
-                return "/".join(parts[:at]), kind
-        if _DEPTH.fullmatch(part):
-            return "/".join(parts[:at]), len(STREAMS)
+        kind = _kind(part)
+        if kind is not None and "/".join(parts[: at + 1]) not in namespaces:
+            return "/".join(parts[:at]), kind
     return "/".join(parts[:-1]), next(kind for kind, (_, pattern) in enumerate(STREAMS) if pattern is None)
+
+
+def _kind(part: str) -> int | None:
+    """The stream that a part of a name names."""
+    for kind, (_, pattern) in enumerate(STREAMS):
+        if pattern is not None and re.fullmatch(pattern, part, re.IGNORECASE):
+            return kind
+    return DEPTH if _DEPTH.fullmatch(part) else None
 
 
 def is_depth_topic(base: str, encoding: str) -> bool:
@@ -72,5 +103,5 @@ def camera_name(namespace: str) -> str:
 
 def side_of(kind: int) -> str:
     """left, right, or empty for neither, of an index into STREAMS."""
-    name = STREAMS[kind][0] if kind < len(STREAMS) else ""
+    name = STREAMS[kind][0] if kind < DEPTH else ""
     return name if name in ("left", "right") else ""

@@ -54,7 +54,7 @@ _LOOKS = (
 
 def unknown_file(path: Path, head: bytes) -> InputError:
     """What to say about a file that no reader knows, from its first bytes."""
-    return InputError(f"{path}: {_look(path, head)}. Known recordings: {KNOWN}.")
+    return InputError(f"{path}: {what_it_is(path, head)}. Known recordings: {KNOWN}.")
 
 
 def empty_folder(path: Path) -> InputError:
@@ -63,11 +63,6 @@ def empty_folder(path: Path) -> InputError:
         f"{path}: no recording there; an RGB-D folder has <camera>/camera_info.yaml and <camera>/image/<stamp_ns>.png "
         f"or .jpg. Known recordings: {KNOWN}."
     )
-
-
-def why_left_out(path: Path, head: bytes) -> str:
-    """Why a file is left out that lies beside recordings and is named like one."""
-    return _look(path, head)
 
 
 def unfinished(path: Path) -> InputError:
@@ -79,7 +74,8 @@ def unfinished(path: Path) -> InputError:
     )
 
 
-def _look(path: Path, head: bytes) -> str:
+def what_it_is(path: Path, head: bytes) -> str:
+    """What a file looks like that no reader knows, and what to do with it, to complete the sentence "<file>: ..."."""
     if not head:
         return "is empty (0 bytes); copy the recording again"
     if not any(head):

@@ -66,7 +66,7 @@ class StereoIntrinsics:
             *eyes,
             size,
             self.R_right_left,
-            self.t_right_left,
+            self.t_right_left.reshape(3, 1),  # OpenCV 5 wants a column
             flags=cv2.CALIB_ZERO_DISPARITY,
             alpha=0,
             newImageSize=size,
@@ -81,7 +81,6 @@ class StereoIntrinsics:
         return Rectification(
             K=K,
             baseline_m=float(-P_right[0, 3] / P_right[0, 0]),
-            R_rect_left=np.asarray(R_left, dtype=np.float64),
             left_maps=maps[0],
             right_maps=maps[1],
         )
@@ -93,8 +92,6 @@ class Rectification:
 
     K: Array  # (3, 3) of both rectified images
     baseline_m: float
-    # (3, 3) from the recorded left eye's axes into the rectified ones: how the tests know where a point must land
-    R_rect_left: Array
     left_maps: tuple[NDArray[Any], NDArray[Any]]  # of cv2.remap
     right_maps: tuple[NDArray[Any], NDArray[Any]]
 

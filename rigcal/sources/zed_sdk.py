@@ -30,11 +30,10 @@ from aruco.model import BadFrame, Camera, Frame
 from aruco.pose_math import Array
 from aruco.svo_sync import MAX_STAMP_NS
 from rigcal.sources.image_file import MAX_PIXELS
+from rigcal.sources.mcap_records import MAGIC
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.zed_gravity import up_of
 from rigcal.sources.zed_player import NotShownError, Pass, Place, Player
-
-MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 def is_available() -> bool:
@@ -52,7 +51,7 @@ def recognises(path: Path, head: bytes) -> bool:
     suffix = path.suffix.lower()
     if suffix not in (".svo", ".svo2") or not os.path.isfile(path) or not any(head):
         return False  # an empty file, or one of zeros, is not the SDK's to explain
-    return is_available() if suffix == ".svo2" or head.startswith(MCAP_MAGIC) else True
+    return is_available() if suffix == ".svo2" or head.startswith(MAGIC) else True
 
 
 def opened(path: Path, options: SourceOptions) -> ZedRecording:
