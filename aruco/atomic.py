@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import BinaryIO
 
 from aruco.errors import OutputError
 
@@ -14,20 +15,25 @@ from aruco.errors import OutputError
 def write_whole(path: Path, data: bytes) -> None:
     """Write all of it or nothing: a crash never leaves half a file. A symbolic link keeps pointing to the file.
 
+    A run that is killed while it writes leaves ``<path>.part``.
+
     Raises:
         OutputError: The file cannot be written.
     """
     goal = _goal(path)
-    part = goal.with_name(goal.name + ".part")
+    stream = _new_part(path, goal)
+    part = Path(stream.name)
     try:
-        with part.open("wb") as stream:
+        with stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
         part.replace(goal)
-    except OSError as error:
+    except BaseException as error:
         _try_remove(part)
-        raise _cannot(path, error) from error
+        if isinstance(error, OSError):
+            raise _cannot(path, error) from error
+        raise
 
 
 def check_writable(path: Path) -> None:
@@ -36,13 +42,23 @@ def check_writable(path: Path) -> None:
     Raises:
         OutputError: It cannot, and why.
     """
-    goal = _goal(path)
-    probe = goal.with_name(goal.name + ".part")
+    probe = _new_part(path, _goal(path))
+    probe.close()
+    _try_remove(Path(probe.name))
+
+
+def _new_part(path: Path, goal: Path) -> BinaryIO:
+    """The file beside the goal that becomes it; never one that is there, nor what a link of this name points to."""
+    part = goal.with_name(goal.name + ".part")
     try:
-        probe.open("ab").close()
+        return part.open("xb")
+    except FileExistsError as error:
+        raise OutputError(
+            f"{part}: is in the way: an interrupted run leaves such a file, or another run is writing it; remove it or "
+            "choose another name."
+        ) from error
     except OSError as error:
         raise _cannot(path, error) from error
-    _try_remove(probe)
 
 
 def _goal(path: Path) -> Path:

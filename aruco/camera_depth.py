@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from aruco.depth_image import check_depth, with_holes
 from aruco.depth_pool import KeptFrame, PooledDepth
 from aruco.errors import InputError
+from aruco.model import name_trouble
 from aruco.pose_math import Array
 
 # The principal point lies near the middle: where it is farther off (share of the image), intrinsics are those of
@@ -27,7 +28,6 @@ FOCAL_SHARES = (0.01, 100.0)
 MAX_CONFIDENCE = 100
 # So many measurements of a pixel can be counted in 16 bits, and no more images can have been pooled.
 MAX_POOLED = np.iinfo(np.uint16).max
-_MAX_NAME = 200
 _INT64 = np.iinfo(np.int64)
 
 
@@ -101,12 +101,8 @@ def check_name(name: str, where: str) -> str:
     Raises:
         InputError: It cannot.
     """
-    usable = 0 < len(name) <= _MAX_NAME and name.isprintable() and not set(name) & set("/\\")
-    if not usable or name in {".", ".."} or name.startswith("_"):
-        raise InputError(
-            f"{where}: {name[:40]!r} cannot be a camera's name: it must not be empty, start with _ or hold slashes; "
-            "rename the camera."
-        )
+    if trouble := name_trouble(name):
+        raise InputError(f"{where}: {name[:40]!r} cannot be a camera's name: {trouble}; rename the camera.")
     return name
 
 

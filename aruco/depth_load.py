@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ MAX_BYTES = 4 * 2**30
 MAX_CHUNK_BYTES = 2**28
 MAX_CAMERAS = 1000
 MAX_KEPT = 1000
+T = TypeVar("T")
 _STAMP = re.compile(r"-?[0-9]{1,19}", re.ASCII)
 
 
@@ -44,30 +46,41 @@ def load_depth_data(path: Path, *, frames: bool = True, blind: bool = False) -> 
     Raises:
         InputError: The file cannot be read, is damaged, of another kind or version, or what it holds is no depth.
     """
+    path = Path(path)
+    return _readable(str(path), lambda: _opened(path, with_frames=frames, blind=blind))
+
+
+def _opened(path: Path, *, with_frames: bool, blind: bool) -> dict[str, CameraDepth]:
     import h5py  # late: only this and writing a store need it
 
-    path = Path(path)
+    with path.open("rb"):
+        pass
+    if not h5py.is_hdf5(path):
+        raise InputError(f"{path}: is not an HDF5 file; give a depth store as --save-depth writes it.")
+    with h5py.File(path, "r", locking=False) as file:
+        return _read(file, path, with_frames=with_frames, blind=blind)
+
+
+def _readable(where: str, read: Callable[[], T]) -> T:
+    """What is read; whatever is wrong with the file says where: file, camera, dataset as far as that is known."""
     try:
-        with path.open("rb"):
-            pass
-        if not h5py.is_hdf5(path):
-            raise InputError(f"{path}: is not an HDF5 file; give a depth store as --save-depth writes it.")
-        with h5py.File(path, "r", locking=False) as file:
-            return _read(file, path, with_frames=frames, blind=blind)
+        return read()
     except RigError:
         raise
     except OSError as error:
         if error.strerror:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
-        raise _damaged(path, error) from error
+            raise InputError(f"{where}: cannot be read ({error.strerror}); check the path.") from error
+        raise _damaged(where, error) from error
     # What h5py raises on a damaged file depends on where the damage is.
     except (RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError) as error:
-        raise _damaged(path, error) from error
+        raise _damaged(where, error) from error
 
 
-def _damaged(path: Path, error: Exception) -> InputError:
+def _damaged(where: str, error: Exception) -> InputError:
     reason = str(error).strip("'\"").splitlines()[0][:120] if str(error) else type(error).__name__
-    return InputError(f"{path}: is cut off or damaged ({reason}); write it again with --save-depth.")
+    return InputError(
+        f"{where} is cut off or damaged ({reason}); copy the file again, or write it again with --save-depth."
+    )
 
 
 def _read(file: Any, path: Path, *, with_frames: bool, blind: bool) -> dict[str, CameraDepth]:
@@ -82,13 +95,15 @@ def _read(file: Any, path: Path, *, with_frames: bool, blind: bool) -> dict[str,
     if not 0 < len(cameras) <= MAX_CAMERAS:
         raise InputError(f"{path}: holds {len(cameras)} cameras; want 1 to {MAX_CAMERAS}: write it again.")
     groups = {name: _group(cameras, check_name(name, str(path)), str(path)) for name in sorted(cameras)}
-    n_bytes = sum(_most_bytes(group, f"{path}: camera {name}", with_frames) for name, group in groups.items())
+    places = {name: f"{path}: camera {name}" for name in groups}
+    n_bytes = sum(
+        _readable(places[name], partial(_most_bytes, group, places[name], with_frames))
+        for name, group in groups.items()
+    )
     if n_bytes > MAX_BYTES:
         raise InputError(f"{path}: holds over {MAX_BYTES >> 30} GiB of depth; keep fewer frames or cameras in a store.")
-    return {
-        name: _read_camera(group, f"{path}: camera {name}", with_frames=with_frames, blind=blind)
-        for name, group in groups.items()
-    }
+    read = partial(_read_camera, with_frames=with_frames, blind=blind)
+    return {name: _readable(places[name], partial(read, group, places[name])) for name, group in groups.items()}
 
 
 def _most_bytes(group: Any, where: str, with_frames: bool) -> int:
@@ -171,7 +186,7 @@ def _own(group: Any, name: str, where: str) -> Any:
 
     if name not in group or not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise InputError(f"{where}: has no {name} of its own; write the store again.")
-    return group[name]
+    return _readable(f"{where}: {name}", lambda: group[name])
 
 
 def _group(group: Any, name: str, where: str) -> Any:
@@ -201,7 +216,7 @@ def _array(group: Any, name: str, shape: tuple[int, int], where: str, kind: type
     if found.external or found.is_virtual or chunk_bytes > MAX_CHUNK_BYTES:
         raise InputError(f"{where}: {name} is kept in a way that no depth store is; write the store again.")
     with np.errstate(over="ignore"):  # beyond single precision nothing is a depth; infinite is a hole
-        return np.asarray(found[()]).astype(kind, copy=False)
+        return np.asarray(_readable(f"{where}: {name}", lambda: found[()])).astype(kind, copy=False)
 
 
 def _fits(given: np.dtype[Any], wanted: np.dtype[Any]) -> bool:

@@ -30,6 +30,7 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 
 # Larger images than this are taken for a damaged header, not for a camera.
 MAX_IMAGE_SIDE_PX = 32768
+MAX_NAME_BYTES = 200  # file systems hold 255, of which suffixes take some
 
 
 def _frozen_array(values: Any, shape: tuple[int, ...], name: str) -> Array:
@@ -128,6 +129,23 @@ class BadFrame:
     camera: str
     stamp_ns: int
     reason: str
+
+
+def name_trouble(name: str) -> str:
+    """Why no camera can be called this, in words; empty if one can.
+
+    A camera's name is that of a folder, of an entry in extrinsics files, and of a group in a depth store.
+    """
+    size = len(name.encode("utf-8", "surrogatepass"))
+    if size > MAX_NAME_BYTES:
+        return f"its name has {size} bytes, and may have {MAX_NAME_BYTES}"
+    if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
+        return "a folder cannot have this name"
+    if name.startswith("_"):
+        return "names that start with _ are no cameras in extrinsics files"
+    if any("\ud800" <= sign <= "\udfff" for sign in name):
+        return "its name is not valid UTF-8"
+    return "" if name.isprintable() else "its name holds a sign that cannot be printed"
 
 
 class Recording(Protocol):

@@ -7,6 +7,7 @@ Leaves    their layouts to native, marker_geometry, depth_save and the report.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -94,11 +95,21 @@ class CalibrateOutputs:
                 out.print(f"Wrote {what} to {path}", markup=False)
 
     def write(self, calibration: Calibration) -> None:
-        """Write every file whole or not at all, the poses last.
+        """Write every file whole, the poses last; where that fails nothing new is left beside them.
 
         Raises:
             OutputError: One cannot be written.
         """
+        new = [goal for path in self.paths if not (goal := path.resolve()).exists()]  # a link stays
+        try:
+            self._write_all(calibration)
+        except BaseException:
+            for goal in new:
+                with suppress(OSError):
+                    goal.unlink(missing_ok=True)
+            raise
+
+    def _write_all(self, calibration: Calibration) -> None:
         if self.marker_map is not None and self.faces:
             save_faces(self.marker_map, self.faces)
         if self.depth is not None:

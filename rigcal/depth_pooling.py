@@ -7,8 +7,8 @@ Leaves    pooling to aruco.depth_pool.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from itertools import chain
 
 import numpy as np
@@ -67,7 +67,7 @@ def pool_recording(
     counter = Counter(progress, "pooling depth", sum(map(len, chosen.values())))
 
     def pooled(camera: Camera) -> CameraDepth | None:
-        reading = _Reading(recording, camera, chosen[camera.name], counter.tick)
+        reading = _Reading(recording, camera, chosen[camera.name], counter)
         frames = iter(reading)
         first = next(frames, None)
         if first is None:
@@ -89,8 +89,12 @@ def pool_recording(
 
     # Each camera holds its images until they are pooled: two at a time keep memory flat.
     with ThreadPoolExecutor(max_workers=max(1, min(jobs, 2))) as pool:
-        results = zip(recording.cameras, pool.map(pooled, recording.cameras))
-        return {camera.name: depth for camera, depth in results if depth is not None}
+        try:
+            results = zip(recording.cameras, pool.map(pooled, recording.cameras))
+            return {camera.name: depth for camera, depth in results if depth is not None}
+        except BaseException:  # the other threads must not read to the end
+            counter.stopped = True
+            raise
 
 
 def depth_digest(depth: CameraDepth) -> str:
@@ -111,28 +115,44 @@ class _Reading:
         recording: Recording,
         camera: Camera,
         indices: Sequence[int],
-        tick: Callable[[], object] = lambda: None,
+        counter: Counter | None = None,
     ) -> None:
-        self._frames = recording.frames(camera.name, indices, depth=True)
-        self._n, self._tick = len(indices), tick
-        self._bad: list[str] = []
+        self._recording, self._camera, self._indices, self._counter = recording, camera.name, indices, counter
+        self._bad_depth: list[str] = []
+        self._bad_image: list[str] = []
         self._empty = 0
 
     def __iter__(self) -> Iterator[DepthFrame]:
-        for frame in self._frames:
-            self._tick()
+        for index, frame in zip(self._indices, self._recording.frames(self._camera, self._indices, depth=True)):
+            if self._counter is not None:
+                self._counter.tick()
+                if self._counter.stopped:
+                    raise CancelledError
             if isinstance(frame, BadFrame):
-                self._bad.append(frame.reason)
+                self._note_bad(index, frame)
             elif frame.depth_m is None or not np.isfinite(frame.depth_m).any():
                 self._empty += 1
             else:
                 yield frame.stamp_ns, frame.depth_m, frame.confidence
 
+    def _note_bad(self, index: int, frame: BadFrame) -> None:
+        """Find out which of the two cannot be read."""
+        (alone,) = self._recording.frames(self._camera, [index])
+        if isinstance(alone, BadFrame):
+            self._bad_image.append(alone.reason)
+        else:
+            self._bad_depth.append(frame.reason)
+
     @property
     def trouble(self) -> str:
         """What is wrong, in words; empty if nothing is."""
-        if not self._n:
+        n = len(self._indices)
+        if not n:
             return "no depth images"
-        told = [f"{len(self._bad)} of {self._n} cannot be read ({self._bad[0]})"] if self._bad else []
-        told += [f"{self._empty} of {self._n} hold no measurement"] if self._empty else []
+        depth, image = self._bad_depth, self._bad_image
+        told = [f"{len(depth)} of {n} cannot be read ({depth[0]})"] if depth else []
+        told += (
+            [f"{len(image)} of {n} are left out as the images beside them cannot be read ({image[0]})"] if image else []
+        )
+        told += [f"{self._empty} of {n} hold no measurement"] if self._empty else []
         return "of its depth images " + ", and ".join(told) if told else ""

@@ -27,6 +27,7 @@ class Listeners:
     """Everybody may be left out."""
 
     frame: OnFrame | None = None  # every image that was read, from several threads
+    looked: Callable[[], object] = _nobody  # that was every image
     target: Callable[[Sequence[Face]], object] = _nobody  # the target's faces, if their map was corrected
     depth: Callable[[Mapping[str, CameraDepth]], object] = _nobody  # every camera's depth, pooled over time
     # How depth agrees with the target before its bias was taken out, and after (empty if it was not); part by part.

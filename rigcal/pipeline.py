@@ -6,7 +6,8 @@ Leaves    every step to the tools in aruco and the rooms of rigcal.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,7 @@ def calibrate(
     if config.align.enabled and config.align.up_from == "imu":
         require_accelerometers(recording)
     evidence = look(recording, target, config, jobs=jobs, progress=progress, on_frame=listeners.frame)
+    listeners.looked()
     diagnosis.require_views(recording, target, config.detect, evidence.seen)
     if config.depth.needed:
         pooled = pool_recording(recording, config.depth.baseline_m, jobs=jobs, progress=progress)
@@ -131,18 +133,27 @@ def calibrate_files(
         alignment.specified_face(target.faces, config.align.ground_face, config.align.ground_marker_id)
     kept = NOTHING_KEPT if fix is None else kept_from_file(fix)
     recording = open_recordings(paths, options or plain_options())
-    if preview is not None:
-        listeners = replace(listeners, frame=PreviewWriter(preview, target.geometry))
     resources = Resources() if jobs is None else Resources(jobs=jobs)
-    return calibrate(
-        recording,
-        target,
-        config,
-        kept=kept,
-        resources=resources,
-        progress=progress,
-        listeners=listeners,
-    )
+    with _previewing(preview, target, listeners) as listening:
+        return calibrate(
+            recording,
+            target,
+            config,
+            kept=kept,
+            resources=resources,
+            progress=progress,
+            listeners=listening,
+        )
+
+
+@contextmanager
+def _previewing(folder: Path | None, target: Target, listeners: Listeners) -> Iterator[Listeners]:
+    """The listeners, and where previews are wished for who writes them."""
+    if folder is None:
+        yield listeners
+        return
+    with PreviewWriter(folder, target.geometry) as writer:
+        yield replace(listeners, frame=writer, looked=writer.finish)
 
 
 def _connections(evidence: Evidence, kept: KeptRig) -> GraphHealth | None:

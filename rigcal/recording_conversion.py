@@ -1,32 +1,27 @@
 """Any recording to an RGB-D folder or an MCAP file: frame by frame, and what is finished is never lost.
 
-Owns      which frames are converted, in which order, making the result appear whole.
-Leaves    reading to rigcal.sources, writing to rgbd_writer and mcap_writer there, knowing an interrupted conversion
-          again to conversion_state.
+Owns      what can be converted to where, making the result appear whole, what the user hears.
+Leaves    reading to rigcal.sources, writing to rgbd_writer and mcap_writer there, which frames in which order to
+          conversion_frames, knowing an interrupted conversion again to conversion_state.
 
 Frames are kept in ``<out>.part``, a folder, until all are there.
 """
 
 from __future__ import annotations
 
-import shutil
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 from loguru import logger
-from numpy.typing import NDArray
 
 from aruco.errors import InputError, OutputError
-from aruco.model import SILENT, BadFrame, Frame, KnowsUp, Progress, Recording
-from aruco.svo_sync import sample, synchronise
-from rigcal.config import Resources
-from rigcal.conversion_state import Indices, held, state_of
+from aruco.model import SILENT, BadFrame, KnowsUp, Progress, Recording
+from rigcal.conversion_frames import GrowingFrames, by_time, missing_frames, packed_ahead, wanted_frames
+from rigcal.conversion_state import Indices, abandon, held, state_of
 from rigcal.recordings import plain_options
 from rigcal.sources import STATE_FILE, UNFINISHED_SUFFIX, open_recordings
 from rigcal.sources.mcap_growing import has_chunk
@@ -39,22 +34,6 @@ MCAP_SUFFIX = ".mcap"
 GROWING_FILE = "frames"
 # Every bad frame after these is counted only.
 SPOKEN_BAD_FRAMES = 5
-# Frames that are packed at once: more take memory, and reading is slower by then.
-MAX_AHEAD = 8
-
-
-class _Frames(Protocol):
-    """Frames that are being written."""
-
-    def finished(self, camera: str) -> NDArray[np.int64]: ...
-
-    def packed(self, frame: Frame) -> Any: ...
-
-    def store(self, packed: Any) -> None: ...
-
-    def finish(self) -> None: ...
-
-    def close(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,13 +45,16 @@ class Converted:
     written: int  # frames, those of earlier runs among them
     kept: int  # of these, those of earlier runs
     bad: int  # frames that could not be read
+    depthless: int  # frames of this run whose depth could not be read, so that they have none
 
     @property
     def sentence(self) -> str:
         """What to tell the user."""
         kept = f", {self.kept} of them by an earlier run" if self.kept else ""
+        of = " of the others" if self.kept else ""
+        depthless = f"; {self.depthless}{of} are without depth, which could not be read" if self.depthless else ""
         bad = f"; {self.bad} could not be read and were left out" if self.bad else ""
-        return f"Wrote {self.written} frames of {self.cameras} cameras to {self.out}{kept}{bad}."
+        return f"Wrote {self.written} frames of {self.cameras} cameras to {self.out}{kept}{depthless}{bad}."
 
 
 def convert_recording(
@@ -107,13 +89,14 @@ def convert_recording(
     for camera in recording.cameras:
         refuse_unusable_name(camera.name)
     depth = _wants_depth(recording, depth)
-    wanted = _wanted(recording, every)
+    wanted = wanted_frames(recording, every)
     goal = out.resolve()
     part = goal.with_name(goal.name + UNFINISHED_SUFFIX)
     state = state_of(recording, wanted, _options_that_matter(options, out, depth, every))
     _tell_what_is_left_behind(recording)
     try:
         with held(part, state), _nothing_left_of_nothing(part):
+            _refuse_place(out, paths)  # again: another run may have ended meanwhile
             frames = _frames(recording, part, out, depth)
             converted = _convert(recording, wanted, frames, depth, progress, part)
             _appear(part, goal)
@@ -132,7 +115,7 @@ def _nothing_left_of_nothing(part: Path) -> Iterator[None]:
         yield
     except BaseException:
         if not _holds_frames(part):
-            shutil.rmtree(part, ignore_errors=True)
+            abandon(part)
         raise
 
 
@@ -160,6 +143,8 @@ def _refuse_place(out: Path, paths: Sequence[Path]) -> None:
         )
     if out.exists() and (not out.is_dir() or out.suffix.lower() == MCAP_SUFFIX or any(out.iterdir())):
         raise OutputError(f"{out}: exists already; choose another place or remove it.")
+    if not out.resolve().parent.is_dir():
+        raise OutputError(f"{out}: the folder {out.parent} does not exist; create it or choose another place.")
 
 
 def _wants_depth(recording: Recording, depth: bool | None) -> bool:
@@ -167,18 +152,6 @@ def _wants_depth(recording: Recording, depth: bool | None) -> bool:
     if depth and not there:
         raise InputError("--depth: no camera of the recording has depth; leave the option out.")
     return there if depth is None else depth
-
-
-def _wanted(recording: Recording, every: int) -> Indices:
-    """The frames to convert; thinned out by moments, so that frames of different cameras still belong together."""
-    stamps = {camera.name: recording.stamps_ns(camera.name) for camera in recording.cameras}
-    if every == 1:
-        return {name: np.arange(len(s)) for name, s in stamps.items()}
-    groups = synchronise(stamps)
-    if not len(groups.groups):  # cameras that share no moment
-        return {name: np.arange(0, len(s), every) for name, s in stamps.items()}
-    kept = sample(groups.groups, every)
-    return {name: column[column >= 0] for name, column in zip(groups.cameras, kept.T)}
 
 
 def _tell_what_is_left_behind(recording: Recording) -> None:
@@ -193,10 +166,11 @@ def _options_that_matter(options: SourceOptions, out: Path, depth: bool, every: 
         "to": "mcap" if out.suffix.lower() == MCAP_SUFFIX else "rgbd",
         "every": every,
         "depth": {"mode": options.depth_mode, "stereo": options.stereo_depth} if depth else None,
+        "topics": sorted(options.topics),  # two depth topics can be of the same images
     }
 
 
-def _frames(recording: Recording, part: Path, out: Path, depth: bool) -> _Frames:
+def _frames(recording: Recording, part: Path, out: Path, depth: bool) -> GrowingFrames:
     if out.suffix.lower() == MCAP_SUFFIX:
         names = [camera.name for camera in recording.cameras]
         with_depth = {name for name in names if depth and len(recording.depth_indices(name))}
@@ -205,18 +179,19 @@ def _frames(recording: Recording, part: Path, out: Path, depth: bool) -> _Frames
 
 
 def _convert(
-    recording: Recording, wanted: Indices, frames: _Frames, depth: bool, progress: Progress, part: Path
+    recording: Recording, wanted: Indices, frames: GrowingFrames, depth: bool, progress: Progress, part: Path
 ) -> Converted:
     """Write the frames that are not there yet, in the order of time."""
-    missing = _missing(recording, wanted, frames)
+    missing = missing_frames(recording, wanted, frames)
     total = sum(map(len, wanted.values()))
     kept = total - sum(map(len, missing.values()))
     if kept:
         logger.info("{}: an earlier run finished {} of {} frames; going on from there", part, kept, total)
     bad: Counter[str] = Counter()
+    depthless: Counter[str] = Counter()
     done = 0
     try:
-        for packed in _packed(_by_time(recording, missing, depth), frames):
+        for packed in packed_ahead(by_time(recording, missing, depth, depthless), frames):
             if isinstance(packed, BadFrame):
                 bad[packed.camera] += 1
                 _tell_bad(packed, bad.total())
@@ -231,7 +206,14 @@ def _convert(
         if there := kept + done - bad.total():
             logger.info("{}: {} finished frames are kept; the same command goes on from there", part, there)
         raise
-    return Converted(out=part, cameras=cameras, written=total - bad.total(), kept=kept, bad=bad.total())
+    return Converted(
+        out=part,
+        cameras=cameras,
+        written=total - bad.total(),
+        kept=kept,
+        bad=bad.total(),
+        depthless=depthless.total(),
+    )
 
 
 def _with_frames(counts: Mapping[str, int]) -> int:
@@ -250,43 +232,6 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:10]) + (f" and {len(names) - 10} others" if len(names) > 10 else "")
 
 
-def _missing(recording: Recording, wanted: Indices, frames: _Frames) -> Indices:
-    return {
-        name: indices[~np.isin(recording.stamps_ns(name)[indices], frames.finished(name))]
-        for name, indices in wanted.items()
-    }
-
-
-def _by_time(recording: Recording, wanted: Indices, depth: bool) -> Iterator[Frame | BadFrame]:
-    """Frames of all cameras in the order of their stamps, one at a time: as recorders write, and as players read."""
-    streams = {name: recording.frames(name, indices.tolist(), depth=depth) for name, indices in wanted.items()}
-    names = list(wanted)
-    stamps = np.concatenate([recording.stamps_ns(name)[wanted[name]] for name in names])
-    owners = np.repeat(np.arange(len(names)), [len(wanted[name]) for name in names])
-    for k in np.argsort(stamps, kind="stable").tolist():
-        yield next(streams[names[owners[k]]])
-
-
-def _packed(frames: Iterator[Frame | BadFrame], to: _Frames) -> Iterator[Any]:
-    """Frames as they will be stored, or BadFrame, in the same order; some are packed while others are read."""
-    jobs = min(Resources().jobs, MAX_AHEAD)
-    with ThreadPoolExecutor(jobs) as pool:
-        waiting: deque[BadFrame | Future[Any]] = deque()
-        try:
-            for frame in frames:
-                waiting.append(frame if isinstance(frame, BadFrame) else pool.submit(to.packed, frame))
-                if len(waiting) > jobs:
-                    yield _done(waiting.popleft())
-            while waiting:
-                yield _done(waiting.popleft())
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _done(waiting: BadFrame | Future[Any]) -> Any:
-    return waiting if isinstance(waiting, BadFrame) else waiting.result()
-
-
 def _tell_bad(frame: BadFrame, count: int) -> None:
     if count <= SPOKEN_BAD_FRAMES:
         logger.warning("camera {}: frame {} is left out: {}", frame.camera, frame.stamp_ns, frame.reason)
@@ -298,7 +243,7 @@ def _appear(part: Path, out: Path) -> None:
     """Make what is finished the result, in one step."""
     if out.suffix.lower() == MCAP_SUFFIX:
         (part / GROWING_FILE).replace(out)
-        shutil.rmtree(part, ignore_errors=True)
+        abandon(part)
         return
     if out.exists():
         out.rmdir()

@@ -42,7 +42,7 @@ def options_from(given: Mapping[str, Any]) -> SourceOptions:
 
 
 def read_cameras(path: Path) -> Mapping[str, Camera]:
-    """The cameras of an intrinsics file: ROS camera_info YAML, or a calibration format that holds intrinsics.
+    """The cameras of an intrinsics file or folder: ROS camera_info YAML, or a calibration that holds intrinsics.
 
     Returns:
         Name -> camera; a camera_info file's only camera is called what the file calls it, else like the file.
@@ -50,6 +50,8 @@ def read_cameras(path: Path) -> Mapping[str, Camera]:
     Raises:
         InputError: The file cannot be read or holds no intrinsics.
     """
+    if path.is_dir():
+        return _of_folder(path)
     head = _head(path)
     if _is_camera_info(head):
         from rigcal.sources.camera_info import load_camera_info
@@ -60,6 +62,18 @@ def read_cameras(path: Path) -> Mapping[str, Camera]:
     from rigcal.formats.registry import cameras_of
 
     return cameras_of(path)
+
+
+def _of_folder(path: Path) -> Mapping[str, Camera]:
+    from rigcal.formats.registry import UnknownFormatError, cameras_of
+
+    try:
+        return cameras_of(path)
+    except UnknownFormatError as error:
+        raise InputError(
+            f"{path}: no intrinsics there; give a file of them, a COLMAP text model, or for videos a folder with "
+            "<video>.yaml for each or camchain.yaml for all."
+        ) from error
 
 
 def _depth_mode(word: str) -> str:

@@ -29,9 +29,10 @@ _OPTIONS = (
     click.option("--same-clock", is_flag=True,
                  help="Videos without time stamps beside them began at the same moment: each counts from its first "
                       "picture."),
-    click.option("--intrinsics", type=click.Path(path_type=Path), metavar="FILE",
-                 help="Intrinsics of the cameras of videos, or of bags without camera info: camera_info, OpenCV or "
-                      "Kalibr YAML, aniposelib TOML. Default: looked for beside the videos."),
+    click.option("--intrinsics", type=click.Path(path_type=Path), metavar="PATH",
+                 help="Intrinsics of the cameras of videos, or of bags instead of camera info: camera_info, OpenCV or "
+                      "Kalibr YAML, aniposelib TOML, a COLMAP text model; of videos also a folder with such files. "
+                      "Default: looked for beside the videos."),
 )  # fmt: skip
 
 

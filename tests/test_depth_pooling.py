@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -45,10 +46,11 @@ class Made:
         for k in indices:
             self.read.append(k)
             made = self._depth(k)
-            if isinstance(made, str):
+            if isinstance(made, str) and (depth or "/image/" in made):
                 yield BadFrame(camera, k, made)
             else:
-                yield Frame(camera=camera, stamp_ns=k, image=IMAGE, depth_m=made if depth else None)
+                wanted = made if depth and not isinstance(made, str) else None
+                yield Frame(camera=camera, stamp_ns=k, image=IMAGE, depth_m=wanted)
 
 
 def camera(name: str, baseline_m: float | None = None) -> Camera:
@@ -81,6 +83,28 @@ def test_frames_that_cannot_be_read_are_told_with_their_reason(told: list[str]) 
     recording = Made(6, lambda k: "a/depth/3.png is truncated" if k == 3 else plain(k))
     assert pooled(recording) == {"a": 5}
     assert told == ["camera a: of its depth images 1 of 6 cannot be read (a/depth/3.png is truncated)\n"]
+
+
+def test_where_the_image_beside_depth_cannot_be_read_that_is_told(told: list[str]) -> None:
+    recording = Made(6, lambda k: {2: "a/image/2.png is cut off", 3: "a/depth/3.png is torn"}.get(k) or plain(k))
+    assert pooled(recording) == {"a": 4}
+    assert told == [
+        "camera a: of its depth images 1 of 6 cannot be read (a/depth/3.png is torn), and 1 of 6 are left out as the "
+        "images beside them cannot be read (a/image/2.png is cut off)\n"
+    ]
+
+
+def test_an_interrupt_ends_the_reading_of_every_camera() -> None:
+    class Interrupted:
+        def step(self, name: str, done: int, total: int) -> None:
+            if done == 1:
+                raise KeyboardInterrupt
+            time.sleep(0.01)  # long enough for the word to reach the other thread
+
+    recording = Made(60, plain, camera("a"), camera("b"), camera("c"))
+    with pytest.raises(KeyboardInterrupt):
+        pool_recording(recording, None, jobs=1, progress=Interrupted())
+    assert len(recording.read) < 30  # not the 60 of the next camera
 
 
 def test_a_camera_without_a_measurement_is_left_out_and_named(told: list[str]) -> None:

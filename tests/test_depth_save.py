@@ -123,8 +123,10 @@ def test_places_that_cannot_be_written_are_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../x", "a/b", "a\\b", "_meta", "a\nb", "a\0b", "x" * 300])
 def test_names_that_lead_elsewhere_are_refused(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="camera's name"):
+    with pytest.raises(InputError, match=r"camera's name: [^:]*; rename the camera") as caught:
         save_depth_data(tmp_path / "x.h5", {name: _camera()})
+    assert ("cannot be printed" in str(caught.value)) == (name == "a\nb")
+    assert ("start with _" in str(caught.value)) == (name == "_meta")
     assert not list(tmp_path.iterdir())
 
 
@@ -337,6 +339,30 @@ def test_a_store_that_is_cut_off_is_refused(store: Path, part: float) -> None:
     with pytest.raises(InputError, match=r"not an HDF5 file|cut off or damaged") as caught:
         load_depth_data(store)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("place", ["depth", "confidence", "frames"])
+def test_a_damaged_chunk_is_told_by_camera_and_dataset(store: Path, place: str) -> None:
+    with h5py.File(store, "r") as file:
+        frames = file["cameras/left/frames"]
+        assert isinstance(frames, h5py.Group)
+        place = place if not place.startswith("frames") else f"frames/{next(iter(frames))}/depth"
+        dataset = file[f"cameras/left/{place}"]
+        assert isinstance(dataset, h5py.Dataset)
+        chunk = dataset.id.get_chunk_info(0)
+    data = bytearray(store.read_bytes())
+    middle = chunk.byte_offset + chunk.size // 2
+    data[middle : middle + 8] = bytes(255 - byte for byte in data[middle : middle + 8])
+    store.write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        load_depth_data(store)
+    names = place.split("/")
+    where = "camera left" if len(names) == 1 else f"camera left, frame {names[1]}"
+    assert str(caught.value).startswith(f"{store}: {where}: {names[-1]} is cut off or damaged (")
+    assert str(caught.value).endswith("; copy the file again, or write it again with --save-depth.")
+    # Where nothing asks for the single frames, they do no harm.
+    if len(names) > 1:
+        assert list(load_depth_data(store, frames=False)) == ["41182735", "left"]
 
 
 def _is_refused(path: Path) -> bool:

@@ -14,11 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from format_rigs import format_rig
 from numpy.typing import NDArray
 
 from aruco.errors import InputError, MissingExtraError
 from aruco.model import BadFrame, Camera, Frame, KnowsUp
 from aruco.pose_math import Array
+from rigcal.formats import colmap
+from rigcal.formats.rig import ExportOptions
 from rigcal.recording_conversion import convert_recording
 from rigcal.recordings import options_from, read_cameras
 from rigcal.sources import open_recordings, svo2, video, zed_sdk
@@ -65,6 +68,7 @@ def rgbd(path: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The source as files: an RGB-D folder, or an MCAP file by its name."""
     with monkeypatch.context() as patch:
         patch.setattr("rigcal.recording_conversion.open_recordings", lambda paths, options: source)
+        path.parent.mkdir(parents=True, exist_ok=True)
         convert_recording([Path("memory")], path)
     return path
 
@@ -127,8 +131,18 @@ def test_one_recording_given_twice_is_called_that(write: Callable[[Path, Source]
 
 
 def test_two_cameras_of_one_name_are_refused_with_the_ways_out() -> None:
-    with pytest.raises(InputError, match=r"camera a is in one and in two; rename it.*--topics"):
-        JoinedRecording([(Path("one"), Source("a")), (Path("two"), Source("a"))])
+    ways = r"camera a is in one and in two; give one of them at a time or, if these are two cameras, {}\."
+
+    class Film(Source):
+        def file_of(self, camera: str) -> Path:
+            return Path("films", f"{camera}.mp4")
+
+    plain, film = (Path("one"), Source("a")), (Path("two"), Film("a"))
+    with pytest.raises(InputError, match=ways.format("rename films/a.mp4")):
+        JoinedRecording([plain, film])
+    # Of a serial number or a topic the name cannot be changed in the file.
+    with pytest.raises(InputError, match=ways.format("make one a folder with rigcal convert and rename .* there")):
+        JoinedRecording([plain, (Path("two"), Source("a"))])
 
 
 # Choosing by content
@@ -430,6 +444,17 @@ def test_a_ros_file_of_intrinsics_is_one_camera_under_its_own_name(tmp_path: Pat
 def test_intrinsics_that_are_not_there_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.yaml: no such file"):
         read_cameras(tmp_path / "none.yaml")
+
+
+def test_a_folder_of_intrinsics_is_a_calibration_or_told_to_be_none(tmp_path: Path) -> None:
+    rig = format_rig({"left": "brown", "right": "pinhole"})
+    colmap.FORMAT.write(rig, tmp_path / "model", ExportOptions())
+    found = read_cameras(tmp_path / "model")
+    assert found.keys() == {"left", "right"}
+    np.testing.assert_allclose(found["left"].K, rig.cameras["left"].K, atol=1e-12)  # half a pixel forth and back
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"empty: no intrinsics there; give a file of them, a COLMAP text model"):
+        read_cameras(tmp_path / "empty")
 
 
 def test_a_converted_folder_is_read_by_the_plain_reader_too(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +23,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from aruco.errors import InputError, OutputError
 from aruco.model import BadFrame, Camera, Frame
-from rigcal import recording_conversion
+from rigcal import conversion_state, recording_conversion
 from rigcal.recording_conversion import Converted, convert_recording
+from rigcal.recordings import plain_options
 from rigcal.sources import open_recordings
 from rigcal.sources.mcap_growing import ChunkMessage, GrowingMcap, packed_chunk
 from rigcal.sources.mcap_writer import namespaces
@@ -38,8 +42,15 @@ PERIOD_NS = 33_333_333
 class Source:
     """A recording of two cameras: a colour one with depth and confidence, and a grey one that is half as fast."""
 
-    def __init__(self, seed: int = 0, n: int = 8, bad: Sequence[int] = (), depth_step_m: float | None = 0.001) -> None:
-        self.seed, self.n, self.bad, self.depth_step_m = seed, n, bad, depth_step_m
+    def __init__(
+        self,
+        seed: int = 0,
+        n: int = 8,
+        bad: Sequence[int] = (),
+        depth_step_m: float | None = 0.001,
+        bad_depth: Sequence[int] = (),
+    ) -> None:
+        self.seed, self.n, self.bad, self.depth_step_m, self.bad_depth = seed, n, bad, depth_step_m, bad_depth
         self.reads: list[tuple[str, int]] = []
         self.cameras: tuple[Camera, ...] = (
             Camera(name="1234", width=W, height=H, K=K, distortion=DISTORTION, baseline_m=0.12),
@@ -66,6 +77,8 @@ class Source:
         image = rng.integers(0, 256, (H, W) if camera == "grey" else (H, W, 3), dtype=np.uint8)
         if camera == "grey" or not depth:
             return Frame(camera=camera, stamp_ns=stamp, image=image)
+        if index in self.bad_depth:
+            return BadFrame(camera, stamp, "has torn depth")
         metres = rng.uniform(0.5, 5.0, (H, W))
         if self.depth_step_m is not None:
             metres = np.rint(metres / self.depth_step_m) * self.depth_step_m
@@ -124,10 +137,10 @@ def test_every_frame_comes_back_as_it_was(
     convert: Callable[..., Converted], tmp_path: Path, name: str, depth_step_m: float | None
 ) -> None:
     source = Source(depth_step_m=depth_step_m)
-    converted = convert(source, tmp_path / "new" / name)
+    converted = convert(source, tmp_path / name)
     assert (converted.written, converted.kept, converted.bad) == (12, 0, 0)
-    assert_same(open_recordings([tmp_path / "new" / name]), source)
-    assert [path.name for path in (tmp_path / "new").iterdir()] == [name]
+    assert_same(open_recordings([tmp_path / name]), source)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_depth_finer_than_the_steps_is_kept_as_float(convert: Callable[..., Converted], tmp_path: Path) -> None:
@@ -177,7 +190,63 @@ def test_a_bad_frame_is_left_out_and_counted(
     assert_same(open_recordings([tmp_path / name]), source, skip=(2, 5))
 
 
+@pytest.mark.parametrize("name", ["out", "out.mcap"])
+@pytest.mark.parametrize("bad_depth", [(3, 4, 6), range(8)])
+def test_an_image_is_kept_where_only_its_depth_cannot_be_read(
+    convert: Callable[..., Converted], tmp_path: Path, name: str, bad_depth: Sequence[int], said: list[str]
+) -> None:
+    source = Source(bad=(1,), bad_depth=bad_depth)
+    converted = convert(source, tmp_path / name)
+    lost = len(set(bad_depth) - {1})
+    assert (converted.written, converted.depthless, converted.bad) == (11, lost, 1)
+    assert f"; {lost} are without depth, which could not be read; 1 could not be read" in converted.sentence
+    assert [line for line in said if "without depth" in line] == [
+        f"camera 1234: frame {source.stamps_ns('1234')[bad_depth[0]]} is written without depth, as are all like it: "
+        "has torn depth"
+    ]
+    recording = open_recordings([tmp_path / name])
+    assert_same(recording, source, depth=False, skip=(1,))
+    with_depth = recording.stamps_ns("1234")[recording.depth_indices("1234")]
+    assert set(with_depth.tolist()) == {int(source.stamps_ns("1234")[k]) for k in range(8) if k not in (1, *bad_depth)}
+    for frame in recording.frames("1234", recording.depth_indices("1234").tolist(), depth=True):
+        expected = source.frame("1234", (frame.stamp_ns - START_NS) // PERIOD_NS, depth=True)
+        assert isinstance(frame, Frame)
+        assert isinstance(expected, Frame)
+        assert frame.depth_m is not None
+        assert expected.depth_m is not None
+        np.testing.assert_allclose(frame.depth_m, expected.depth_m, rtol=2.5e-7)
+
+
+def test_with_images_alone_nobody_asks_for_depth(convert: Callable[..., Converted], tmp_path: Path) -> None:
+    source = Source(bad=(1,), bad_depth=(3,))
+    converted = convert(source, tmp_path / "out", depth=False)
+    assert (converted.written, converted.depthless, converted.bad) == (11, 0, 1)
+    assert len(source.reads) == 12 + 2  # each once, and the first of each camera, to know the recording by
+
+
 # Interruptions
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """A file, or all files below a folder."""
+    return {str(p.relative_to(path)): p.read_bytes() for p in (path, *path.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("steps", [2, 7, 12])
+@pytest.mark.parametrize("name", ["out", "out.mcap"])
+def test_with_depth_that_cannot_be_read_a_second_run_gives_the_same_bytes(
+    convert: Callable[..., Converted], tmp_path: Path, name: str, steps: int
+) -> None:
+    bad: dict[str, Any] = {"bad": (1,), "bad_depth": (0, 3, 4, 6)}
+    with pytest.raises(KeyboardInterrupt):
+        convert(Source(**bad), tmp_path / name, progress=StopAfter(steps))
+    converted = convert(Source(**bad), tmp_path / name)
+    whole = convert(Source(**bad), tmp_path / f"whole_{name}")
+    assert contents(tmp_path / name) == contents(tmp_path / f"whole_{name}")
+    assert (converted.written, converted.bad, whole.depthless) == (whole.written, whole.bad, 4)
+    assert 0 <= converted.depthless < 4
+    if converted.depthless:
+        assert f"by an earlier run; {converted.depthless} of the others are without depth" in converted.sentence
 
 
 @pytest.mark.parametrize("steps", [1, 5, 12])
@@ -288,6 +357,18 @@ def test_what_is_left_of_something_else_is_refused(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_depth_of_other_topics_is_not_mixed_in(convert: Callable[..., Converted], tmp_path: Path) -> None:
+    def topics(*names: str) -> Any:
+        return replace(plain_options(), topics=tuple(f"1234=/image,/info,/{name}" for name in names))
+
+    with pytest.raises(KeyboardInterrupt):
+        convert(Source(), tmp_path / "out", progress=StopAfter(2), options=topics("a", "b"))
+    for other in (topics("a", "c"), None):
+        with pytest.raises(OutputError, match=r"converting something else \(--topics\)"):
+            convert(Source(), tmp_path / "out", options=other)
+    assert convert(Source(), tmp_path / "out", options=topics("b", "a")).kept == 2  # their order means nothing
+
+
 def test_a_second_run_at_the_same_time_is_kept_out(convert: Callable[..., Converted], tmp_path: Path) -> None:
     if os.name == "nt":
         pytest.skip("needs locks of files")
@@ -296,13 +377,163 @@ def test_a_second_run_at_the_same_time_is_kept_out(convert: Callable[..., Conver
     class Second:
         def step(self, name: str, done: int, total: int) -> None:
             if not refused:
-                with pytest.raises(OutputError, match="another run is writing it") as error:
+                with pytest.raises(OutputError, match="another conversion is writing it") as error:
                     convert(Source(), tmp_path / "out")
                 refused.append(str(error.value))
 
     convert(Source(), tmp_path / "out", progress=Second())
     assert len(refused) == 1
     assert_same(open_recordings([tmp_path / "out"]), Source())
+
+
+def test_of_two_runs_that_begin_at_once_one_goes_on(tmp_path: Path) -> None:
+    if os.name == "nt":
+        pytest.skip("needs locks of files")
+    code = """
+import multiprocessing, sys
+from pathlib import Path
+from aruco.errors import OutputError
+from rigcal.conversion_state import held
+def run(turn, answers, folder):
+    for k in range(100):
+        turn.wait()
+        try:
+            with held(folder / f"{k}.part", {"k": "x" * 5000}):
+                answers.put((k, ""))
+                turn.wait()  # nobody is done before the other has tried
+        except OutputError as error:
+            answers.put((k, str(error)))
+            turn.wait()
+context = multiprocessing.get_context("fork")
+turn, answers = context.Barrier(2), context.Queue()
+runs = [context.Process(target=run, args=(turn, answers, Path(sys.argv[1]))) for _ in range(2)]
+for one in runs: one.start()
+for k, answer in sorted(answers.get(timeout=60) for _ in range(200)): print(k, answer)
+for one in runs: one.join()
+"""
+    run = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
+    lines = run.stdout.splitlines()
+    assert lines[::2] == [f"{k} " for k in range(100)]
+    for k, line in enumerate(lines[1::2]):
+        assert line.startswith(f"{k} {tmp_path / f'{k}.part'}: another conversion is writing it")
+        assert (tmp_path / f"{k}.part" / "conversion.json").stat().st_size > 5000
+
+
+def test_two_conversions_started_together_make_one_whole_result(demo_folder: Path, tmp_path: Path) -> None:
+    if os.name == "nt":
+        pytest.skip("needs locks of files")
+    code = """
+import multiprocessing, sys
+from pathlib import Path
+from aruco.errors import OutputError
+from rigcal.recording_conversion import convert_recording
+def run(turn, answers, source, folder):
+    for k in range(8):
+        out = folder / (f"{k}.mcap" if k % 2 else f"{k}")
+        turn.wait()
+        try:
+            answers.put((k, convert_recording([source], out, every=20).sentence))
+        except OutputError as error:
+            answers.put((k, str(error)))
+context = multiprocessing.get_context("fork")
+turn, answers = context.Barrier(2), context.Queue()
+runs = [context.Process(target=run, args=(turn, answers, *map(Path, sys.argv[1:]))) for _ in range(2)]
+for one in runs: one.start()
+for k, answer in sorted(answers.get(timeout=60) for _ in range(16)): print(k, answer)
+for one in runs: one.join()
+"""
+    arguments = [sys.executable, "-c", code, str(demo_folder), str(tmp_path)]
+    run = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    answers = run.stdout.splitlines()
+    for k in range(8):
+        two = [line for line in answers if line.startswith(f"{k} ")]
+        assert sum(" Wrote " in line for line in two) == 1, two
+        # The second to begin, or one so late that the first was done.
+        assert sum("another conversion is writing it" in line or "exists already" in line for line in two) == 1, two
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        ["0", "1.mcap", "2", "3.mcap", "4", "5.mcap", "6", "7.mcap"]
+    )
+    assert all(contents(tmp_path / f"{k}") == contents(tmp_path / "0") for k in (2, 4, 6))
+    assert all(contents(tmp_path / f"{k}.mcap") == contents(tmp_path / "1.mcap") for k in (3, 5, 7))
+
+
+@pytest.mark.parametrize("end", ["renamed", "removed"])
+def test_a_folder_that_goes_away_before_it_is_locked_is_made_anew(
+    end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part, tries = tmp_path / "out.part", []
+
+    def late(path: Path, file: Any) -> None:
+        tries.append(path)
+        if len(tries) == 1:  # who had it ends now
+            part.rename(tmp_path / "out") if end == "renamed" else shutil.rmtree(part)
+
+    monkeypatch.setattr(conversion_state, "_lock", late)
+    with conversion_state.held(part, {"options": {}}):
+        assert len(tries) == 2
+        assert json.loads((part / "conversion.json").read_text()) == {"options": {}}
+    assert end == "removed" or (tmp_path / "out" / "conversion.json").read_bytes() == b""
+
+
+def test_a_state_that_was_cut_off_is_begun_anew_but_never_beside_frames(
+    convert: Callable[..., Converted], tmp_path: Path
+) -> None:
+    part = tmp_path / "out.part"
+    for text in ("", '{"format": "rigcal.conv'):
+        part.mkdir()
+        (part / "conversion.json").write_text(text)
+        assert convert(Source(), tmp_path / "out").kept == 0
+        shutil.rmtree(tmp_path / "out")
+        (part / "1234" / "image").mkdir(parents=True)
+        (part / "conversion.json").write_text(text)
+        with pytest.raises(OutputError, match="is no unfinished conversion"):
+            convert(Source(), tmp_path / "out")
+        assert (part / "conversion.json").read_text() == text
+        shutil.rmtree(part)
+
+
+def test_where_the_state_cannot_be_written_nothing_is_left(
+    convert: Callable[..., Converted], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(number: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match=r"out: cannot be written \(No space left on device\)"):
+        convert(Source(), tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_where_a_place_has_no_locks_that_is_told(
+    convert: Callable[..., Converted], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str]
+) -> None:
+    fcntl = pytest.importorskip("fcntl")
+
+    def none(file: Any, how: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    assert convert(Source(), tmp_path / "out").written == 12
+    assert [line for line in said if "cannot be locked there (No locks available)" in line]
+
+
+def test_a_result_that_another_run_finished_meanwhile_is_left_alone(
+    convert: Callable[..., Converted], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("out", "out.mcap"):
+        with monkeypatch.context() as patch:
+            looked_up = recording_conversion.state_of
+
+            def slow(*arguments: Any, name: str = name, looked_up: Any = looked_up) -> Any:
+                patch.undo()
+                convert(Source(seed=1), tmp_path / name)
+                return looked_up(*arguments)
+
+            patch.setattr(recording_conversion, "state_of", slow)
+            with pytest.raises(OutputError, match="exists already"):
+                convert(Source(), tmp_path / name)
+        assert_same(open_recordings([tmp_path / name]), Source(seed=1))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "out.mcap"]
 
 
 # Places
@@ -318,6 +549,8 @@ def test_a_second_run_at_the_same_time_is_kept_out(convert: Callable[..., Conver
         ("film.mp4", "RGB-D folder or to an .mcap file"),
         ("out.part", "RGB-D folder or to an .mcap file"),
         ("file/out", "file/out"),
+        ("no/such/out", r"no/such/out: the folder .*no/such does not exist; create it or choose another place"),
+        ("no/out.mcap", r"no/out\.mcap: the folder .*no does not exist; create it or choose another place"),
     ],
 )
 def test_places_that_cannot_be_written_are_refused_and_untouched(
@@ -346,12 +579,25 @@ def test_a_full_disk_is_one_sentence_and_keeps_what_is_there(
     assert convert(Source(), tmp_path / "out").kept == 3
 
 
+@pytest.mark.parametrize(("name", "why"), [("a\nb", "cannot be printed"), ("a\udcff", "not valid UTF-8")])
+def test_a_camera_name_that_calibrating_would_refuse_is_refused(
+    convert: Callable[..., Converted], tmp_path: Path, name: str, why: str
+) -> None:
+    source = Source()
+    source.cameras = (Camera(name=name, width=W, height=H, K=K), source.cameras[1])
+    for out in ("out", "out.mcap"):
+        with pytest.raises(OutputError, match=f"{why}; rename the camera"):
+            convert(source, tmp_path / out)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", ["../escape", "a/b", ".."])
 def test_a_camera_name_that_leads_elsewhere_is_refused(
     convert: Callable[..., Converted], tmp_path: Path, name: str
 ) -> None:
     source = Source()
     source.cameras = (Camera(name=name, width=W, height=H, K=K), source.cameras[1])
+    (tmp_path / "inner").mkdir()
     for out in ("out", "out.mcap"):
         with pytest.raises(OutputError, match="rename the camera"):
             convert(source, tmp_path / "inner" / out)
@@ -473,7 +719,12 @@ def test_the_state_tells_what_is_converted(convert: Callable[..., Converted], tm
     with pytest.raises(KeyboardInterrupt):
         convert(Source(), tmp_path / "out", progress=StopAfter(1), every=3)
     state = json.loads((tmp_path / "out.part" / "conversion.json").read_text())
-    assert state["options"] == {"to": "rgbd", "every": 3, "depth": {"mode": "NEURAL", "stereo": False}}
+    assert state["options"] == {
+        "to": "rgbd",
+        "every": 3,
+        "depth": {"mode": "NEURAL", "stereo": False},
+        "topics": [],
+    }
     assert state["cameras"].keys() == {"1234", "grey"}
 
 

@@ -24,7 +24,6 @@ from rigcal.sim import Simulation
 from rigcal.sources import zed_sdk
 from rigcal.sources.camera_info import dump_camera_info, load_camera_info
 from rigcal.sources.rgbd_folder import RgbdFolder
-from rigcal.sources.zed_conf import factory_calibration
 
 # The same pixels and stamps give the same poses but for the rounding of sums.
 SAME_M, SAME_RAD = 1e-9, 1e-9
@@ -172,17 +171,16 @@ def zed_takes(folder: Path, demo: Simulation, recording: RgbdFolder) -> Path:
     folder.mkdir()
     (folder / "factory.conf").write_text(svo2_writer.conf_text())
     width, height = svo2_writer.SIZE
-    R_rect_left = factory_calibration(folder / "factory.conf", width, height).rectification().R_rect_left
     left, _ = svo2_writer.eyes()
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 1, 2).astype(np.float64)
-    rays = cv2.undistortPoints(pixels, left.K, left.distortion, R=R_rect_left).reshape(height, width, 2)
+    rays = cv2.undistortPoints(pixels, left.K, left.distortion, R=svo2_writer.R_rect_left()).reshape(height, width, 2)
     for camera in recording.cameras:
         seen = (rays @ camera.K[:2, :2].T + camera.K[:2, 2]).astype(np.float32)
         stamps = recording.stamps_ns(camera.name).tolist()
         pairs = []
         for frame in recording.frames(camera.name, range(len(stamps))):
             assert isinstance(frame, Frame)
-            eye = cv2.remap(frame.image, seen, np.zeros(0, np.float32), cv2.INTER_CUBIC)
+            eye = cv2.remap(frame.image, seen[..., 0], seen[..., 1], cv2.INTER_CUBIC)
             pairs.append(np.repeat(np.hstack([eye, eye])[..., None], 3, axis=2))
         up = demo.T_world_cam[camera.name][1, :3]  # of the true world, +Y up, in the camera's axes
         clip = svo2_writer.Clip(pairs=pairs, stamps_ns=stamps, accelerations=[(9.81 * up).tolist()] * 20)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import shutil
 import subprocess
 import sys
 import zlib
@@ -168,10 +169,11 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 MATRIX = "{{rows: {}, cols: {}, data: [{}]}}"
 BAD_INFO = {
     "lacks image_width, camera_matrix": info(image_width=None, camera_matrix=None),
-    "image_width must be a whole number": info(image_width="32.5"),
-    "image_height must be a whole number": info(image_height="-24"),
-    "image size 0 x 24": info(image_width="0"),
-    "image size 999999 x 24": info(image_width="999999"),
+    "image_width must be a whole number from 1 to 32768, got '32.5'": info(image_width="32.5"),
+    "image_height must be a whole number from 1 to 32768, got '-24'": info(image_height="-24"),
+    "image_width must be a whole number from 1 to 32768, got '0'": info(image_width="0"),
+    "image_width must be a whole number from 1 to 32768, got '1000000000'": info(image_width="1000000000"),
+    "rows must be a whole number from 0 to 65535, got '-3'": info(camera_matrix=MATRIX.format(-3, 3, "30")),
     "NaN": info(camera_matrix=MATRIX.format(3, 3, "nan, 0, 15.5, 0, 30, 11.5, 0, 0, 1")),
     "ordinary numbers": info(camera_matrix=MATRIX.format(3, 3, ".nan, 0, 15.5, 0, 30, 11.5, 0, 0, 1")),
     "focal lengths must be positive": info(camera_matrix=MATRIX.format(3, 3, "0, 0, 15.5, 0, 30, 11.5, 0, 0, 1")),
@@ -534,6 +536,17 @@ def test_without_depth_only_images_are_written(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "out" / "right").iterdir()) == ["camera_info.yaml", "image"]
 
 
+def test_a_camera_called_image_is_one(tmp_path: Path) -> None:
+    for names in (["image"], ["image", "left"]):
+        out = tmp_path / str(len(names))
+        for name in names:
+            make_camera(out / name, {"5.png": encoded(picture(1))})
+        for path in (out, out / "image"):
+            recording = open_recordings([path])
+            assert [camera.name for camera in recording.cameras] == (names if path == out else ["image"])
+            assert recording.stamps_ns("image").tolist() == [5]
+
+
 class Watcher:
     """Looks at the half-written folder after each frame, and may stop the writing."""
 
@@ -597,6 +610,26 @@ def test_a_camera_name_that_leads_elsewhere_is_refused(tmp_path: Path, name: str
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        (b"a\nb", "its name holds a sign that cannot be printed"),
+        (b"a\xff", "its name is not valid UTF-8"),
+        (b"_meta", "names that start with _ are no cameras in extrinsics files"),
+    ],
+)
+def test_a_folder_whose_name_no_camera_can_have_is_refused_with_the_reason(
+    tmp_path: Path, name: bytes, why: str
+) -> None:
+    shown = os.fsdecode(name)
+    sound = make_camera(tmp_path / "rec" / "sound", {"1.png": encoded(picture(0))})
+    shutil.copytree(sound, tmp_path / "rec" / shown)
+    for place in (tmp_path / "rec", tmp_path / "rec" / shown):
+        with pytest.raises(InputError) as error:
+            RgbdFolder(place)
+        assert str(error.value) == f"{tmp_path / 'rec'}: camera {shown!r}: {why}; rename its folder."
+
+
 # Opening
 
 
@@ -617,8 +650,13 @@ def test_two_cameras_of_one_name_are_refused_with_both_paths(tmp_path: Path) -> 
     for name in ("one", "two"):
         make_camera(tmp_path / name / "left", {"5.png": encoded(picture(1))})
     for paths in ([tmp_path / "one", tmp_path / "two"], [tmp_path]):
-        with pytest.raises(InputError, match=f"camera left is in {tmp_path / 'one'} and in {tmp_path / 'two'}"):
+        with pytest.raises(
+            InputError, match=f"camera left is in {tmp_path / 'one'} and in {tmp_path / 'two'}"
+        ) as error:
             open_recordings(paths)
+        assert f"at a time or, if these are two cameras, rename its folder in {tmp_path / 'two'}." in str(error.value)
+    with pytest.raises(InputError, match=f"rename its folder in {tmp_path / 'two'}\\."):
+        open_recordings([tmp_path / "one", tmp_path / "two" / "left"])
 
 
 def test_other_paths_are_refused_with_what_is_known(tmp_path: Path) -> None:
