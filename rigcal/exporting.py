@@ -51,7 +51,7 @@ def export(
 
     Raises:
         InputError: Something cannot be read, or the format cannot hold it.
-        OutputError: The output cannot be written, is an input, or nothing that this conversion wrote earlier.
+        OutputError: The output cannot be written, is an input, is there in a recording already, or in another format.
     """
     given = source_options or plain_options()
     _refuse_to_replace(
@@ -127,7 +127,7 @@ def _with_cameras(rig: Rig, cameras: Mapping[str, Camera], where: str, cure: str
 
 
 def _refuse_to_replace(out: Path, to: Format, inputs: Sequence[Path], recordings: Sequence[Path]) -> None:
-    """See that writing replaces no input, no calibration in another format, and in recordings nothing but its own.
+    """See that writing replaces no input, nothing in or beside a recording, and no calibration in another format.
 
     Raises:
         OutputError: It would, or nobody can tell.
@@ -135,18 +135,17 @@ def _refuse_to_replace(out: Path, to: Format, inputs: Sequence[Path], recordings
     try:
         if _is_input(out, inputs):
             raise OutputError(f"{out}: is an input; choose another name for the output.")
+        # Whoever wrote it: a recording's own ground truth and lenses look like an earlier output.
+        if _is_recorded(out, recordings):
+            raise OutputError(
+                f"{out}: lies in a recording that is given, or beside it, where no file is ever replaced; choose "
+                "another name for the output, or remove it if it is an earlier one."
+            )
         there = registry.format_of(out)
-        if there == to.name:
-            return
-        if there is not None:
+        if there not in (None, to.name):
             raise OutputError(
                 f"{out}: is a calibration in another format ({there}), which {to.name} does not replace; remove it "
                 "or choose another name for the output."
-            )
-        if _is_recorded(out, recordings):
-            raise OutputError(
-                f"{out}: lies in a recording that is given, or beside it, where only an earlier {to.name} output is "
-                "replaced; choose another name for the output."
             )
     except OSError as error:
         raise OutputError(f"{out}: cannot be looked at ({error.strerror or error}); choose another place.") from error

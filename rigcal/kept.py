@@ -35,7 +35,8 @@ class KeptRig:
     entries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # as they stand in the file
     meta: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # OF_CAMERAS -> camera, likewise
     covariance: Mapping[str, Array] = field(default_factory=dict)  # (6, 6), where the file has it
-    world: Mapping[str, Any] = field(default_factory=dict)  # the file's _meta.world
+    # The file's _meta.world; cameras that come from no file are in the target's.
+    world: Mapping[str, Any] = field(default_factory=lambda: {"origin": "target"})
     file: str = "the file to keep"  # its name
     digest: str = ""  # SHA-256 of poses and world
 
@@ -52,7 +53,7 @@ class KeptRig:
     @property
     def origin(self) -> str:
         """What the origin of the file's world is tied to."""
-        return self.world.get("origin", "target")
+        return self.world.get("origin", "unknown")
 
     def only(self, names: Collection[str]) -> KeptRig:
         """The same world, which only some of the cameras carry: the others may be moved."""
@@ -94,8 +95,8 @@ def kept_of(content: Mapping[str, Any], path: Path) -> KeptRig:
 
 def _world(given: Any, path: Path) -> dict[str, Any]:
     if not isinstance(given, dict):
-        return {"up": None, "origin": "camera"}
-    up, origin = given.get("up"), given.get("origin", "target")
+        return {"up": None, "origin": "unknown"}
+    up, origin = given.get("up"), given.get("origin", "unknown")
     if not isinstance(origin, str) or (up is not None and up not in native.UP_VECTORS.values()):
         raise InputError(
             f"{path}: _meta.world wants up [0, 1, 0], [0, -1, 0] or null and an origin in words, not {up!r} and "

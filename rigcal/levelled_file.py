@@ -108,8 +108,8 @@ def rig_file(path: Path) -> RigFile:
     says_up = isinstance(world, dict) and "up" in world
     if says_up and kept.up is None:
         raise InputError(
-            f"{path}: its world does not stand upright (_meta.world.up is null), so no plane can be told to be the "
-            "floor; run calibrate-extrinsics again with --auto-align."
+            f"{path}: its world does not say which way is up (_meta.world.up is null), so no plane can be told to be "
+            f"the floor; {_what_to_do(kept.origin)}"
         )
     far = {name: float(np.linalg.norm(T[:3, 3])) for name, T in kept.T_world_cam.items()}
     name = max(far, key=lambda name: far[name])
@@ -129,6 +129,16 @@ def rig_file(path: Path) -> RigFile:
         },
         up=kept.up or "+y",
         up_is_assumed=not says_up,
+    )
+
+
+def _what_to_do(origin: str) -> str:
+    """About a world of which nobody knows what is up; only calibrate-extrinsics ties one to a target or a floor."""
+    if origin not in ("camera", "unknown"):
+        return "run calibrate-extrinsics again with --auto-align."
+    return (
+        "if you know that +y of this world points up, write [0, 1, 0] for up under _meta.world there ([0, -1, 0] if -y "
+        "does); if nobody knows, give extrinsics that calibrate-extrinsics has made with --auto-align."
     )
 
 

@@ -197,15 +197,56 @@ def test_what_a_recording_consists_of_is_not_replaced(truth: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_earlier_output_is_replaced_in_a_recording_too(name: str, truth: Path, demo_folder: Path, tmp_path: Path):
+def test_an_earlier_output_is_replaced_but_not_in_a_recording(
+    name: str, truth: Path, demo_folder: Path, tmp_path: Path
+) -> None:
     recording = shutil.copytree(demo_folder, tmp_path / "rec")
-    out = out_of(name, recording)
+    out, inside = out_of(name, tmp_path), out_of(name, recording)
     written = []
     for _ in range(2):
         result = convert(truth, "--to", name, "-o", out, "--recording", recording)
         assert result.exit_code == 0, result.output
-        written.append({path.name: path.read_bytes() for path in ([out] if out.is_file() else out.iterdir())})
+        written.append(files_of(out))
     assert written[0] == written[1]
+    arguments = (truth, "--to", name, "-o", inside, "--recording", recording)
+    assert convert(*arguments).exit_code == 0
+    assert_one_sentence(convert(*arguments), inside.name, "lies in a recording that is given, or beside it")
+    assert files_of(inside) == written[0]
+
+
+def files_of(out: Path) -> dict[str, bytes]:
+    return {
+        path.name.removesuffix(out.suffix): path.read_bytes() for path in ([out] if out.is_file() else out.iterdir())
+    }
+
+
+@pytest.mark.parametrize(("name", "file"), [("native", "truth.json"), ("tum", "groundtruth.txt")])
+def test_the_truth_of_a_recording_is_not_replaced(
+    name: str, file: str, truth: Path, demo_folder: Path, tmp_path: Path
+) -> None:
+    """Though it has the format that is written."""
+    recording = shutil.copytree(demo_folder, tmp_path / "rec")
+    one = Rig(T_world_cam={min(read_rig(truth).T_world_cam): np.eye(4)}, up="+y")
+    format_named(name).write(one, recording / file, ExportOptions())
+    before = (recording / file).read_bytes()
+    result = convert(truth, "--to", name, "-o", recording / file, "--recording", recording)
+    assert_one_sentence(result, file, "lies in a recording that is given, or beside it", "remove it")
+    assert (recording / file).read_bytes() == before
+
+
+def test_the_lens_of_a_video_beside_is_not_replaced(tmp_path: Path) -> None:
+    camera = Camera(name="right", width=160, height=120, K=np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]]))
+    rig = Rig(T_world_cam={"right": np.eye(4)}, up="+y", cameras={"right": camera})
+    format_named("native").write(rig, tmp_path / "in.json", ExportOptions())
+    video = tmp_path / "vids" / "left.mp4"
+    video.parent.mkdir()
+    video.write_bytes(b"precious")
+    lens = video.with_name("right.yaml")
+    format_named("opencv").write(rig, lens, ExportOptions())
+    before = lens.read_bytes()
+    result = convert(tmp_path / "in.json", "--to", "opencv", "-o", lens, "--recording", video)
+    assert_one_sentence(result, "right.yaml: lies in a recording that is given, or beside it")
+    assert lens.read_bytes() == before
 
 
 def test_intrinsics_that_a_recording_was_read_with_are_not_replaced(tmp_path: Path) -> None:
@@ -215,18 +256,16 @@ def test_intrinsics_that_a_recording_was_read_with_are_not_replaced(tmp_path: Pa
     write_video(tmp_path / "left.mp4", moving_images(2))
     camera = Camera(name="left", width=160, height=120, K=np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]]))
     rig = Rig(T_world_cam={"left": np.eye(4)}, up="+y", cameras={"left": camera})
-    source, chain = tmp_path / "in.json", tmp_path / "camchain.yaml"
+    source, chain = tmp_path / "in.json", tmp_path / "left" / "camera_info.yaml"
+    chain.parent.mkdir()
     format_named("native").write(rig, source, ExportOptions())
     format_named("kalibr").write(rig, chain, ExportOptions())
     before = chain.read_bytes()
     arguments = (source, "--to", "kalibr", "-o", chain, "--recording", tmp_path / "left.mp4")
-    assert_one_sentence(convert(*arguments), "camchain.yaml: is an input, where the recording's intrinsics are")
+    assert_one_sentence(convert(*arguments), "camera_info.yaml: is an input, where the recording's intrinsics are")
     assert chain.read_bytes() == before
     # Where they are not looked for it is an earlier output like any other.
-    chain = chain.rename(tmp_path / "rig.yaml")
-    result = convert(
-        source, "--to", "kalibr", "-o", chain, "--recording", tmp_path / "left.mp4", "--intrinsics", source
-    )
+    result = convert(*arguments, "--intrinsics", source)
     assert result.exit_code == 0, result.output
 
 

@@ -154,7 +154,7 @@ def test_a_file_with_nothing_but_poses_is_kept(folder: Path, three: Path, tmp_pa
     result = calibrate([folder], folder, tmp_path / "out.json", "--fix", tmp_path / "plain.json")
     assert result.exit_code == 0, result.output
     meta = json.loads((tmp_path / "out.json").read_text())["_meta"]
-    assert meta["world"] == {"up": None, "origin": "camera"}
+    assert meta["world"] == {"up": None, "origin": "unknown"}
 
 
 # --- parts ----------------------------------------------------------------------------------------------------------

@@ -279,3 +279,18 @@ def test_an_image_of_no_camera_of_the_rig_is_refused(folder: Path):
         InputError, match=r"'z_f' is of no camera in rig_config\.json, which has a, b12, front, left, z"
     ):
         FORMAT.read(folder)
+
+
+def test_a_camera_outside_the_rig_is_called_after_its_folder_and_told(tmp_path: Path):
+    """COLMAP's rig_configurator gives such a camera a rig of its own."""
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    images = ["left/0.png", "right/0.png", "phone/IMG_1.jpg"]
+    lines = (f"{n} 1 0 0 0 {n} 0 0 1 {image}\n\n" for n, image in enumerate(images, start=1))
+    (tmp_path / "images.txt").write_text("".join(lines))
+    rigs = [{"cameras": [{"image_prefix": "left/", "ref_sensor": True}, {"image_prefix": "right/"}]}]
+    (tmp_path / "rig_config.json").write_text(json.dumps(rigs))
+    rig, said = said_of(tmp_path)
+    assert rig is not None
+    assert list(rig.T_world_cam) == ["left", "phone", "right"]
+    (told,) = said
+    assert "camera phone, called after the folder of its images, is not in rig_config.json" in told

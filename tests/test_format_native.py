@@ -13,13 +13,14 @@ from loguru import logger
 from scipy.spatial.transform import Rotation
 
 from aruco.errors import InputError
-from aruco.model import UpAxis
+from aruco.model import Calibration, CameraPose, UpAxis
 from aruco.pose_math import make_pose
 from rigcal.formats import registry
-from rigcal.formats.native import read_poses
+from rigcal.formats.native import read_poses, write_extrinsics
 from rigcal.formats.native_rig import FORMAT
 from rigcal.formats.rig import ExportOptions, Rig, y_up
 from rigcal.kept import kept_from_file
+from rigcal.solve.graph import graph_health
 
 KINDS = {"front left": "brown", "34563472": "fisheye", "zwölf": "rational"}
 
@@ -113,9 +114,33 @@ def test_a_mark_of_the_byte_order_does_not_matter(tmp_path: Path) -> None:
 
 def test_a_file_larger_than_any_calibration_is_not_parsed(tmp_path: Path) -> None:
     path = tmp_path / "bomb.json"
-    path.write_text('{"a": {"pose": "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "x": [' + "{}," * (2 * 2**20) + "{}]}}")
-    with pytest.raises(InputError, match="over 4 MiB"):
+    path.write_text('{"a": {"pose": "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "x": [' + "{}," * (6 * 2**20) + "{}]}}")
+    with pytest.raises(InputError, match="over 16 MiB, which is not an extrinsics file"):
         registry.read_rig(path)
+
+
+def test_a_rig_of_hundreds_of_cameras_that_share_frames_is_read(tmp_path: Path) -> None:
+    names = [str(30000000 + n) for n in range(260)]
+    health = graph_health({name: range(20) for name in names}).as_dict()
+    cameras = [
+        CameraPose(
+            camera=name,
+            T_world_cam=np.eye(4),
+            n_frames=20,
+            n_markers=40,
+            rms_px=0.123456789012,
+            spread_m=0.00123456789,
+            spread_rad=0.001234567,
+            covariance=np.full((6, 6), 1.2345678901234567e-8) + np.eye(6) * 1e-6,
+        )
+        for name in names
+    ]
+    path = tmp_path / "hall.json"
+    write_extrinsics(
+        path, Calibration(cameras=tuple(cameras), notes={"connections": health}, lost={}, up="+y", frames={})
+    )
+    assert path.stat().st_size > 4 * 2**20  # more than was read once
+    assert kept_from_file(path).T_world_cam.keys() == set(names)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +221,7 @@ def test_every_origin_that_is_written_is_explained() -> None:
     ("meta", "words"),
     [
         ({"version": 99}, "of version 99, and this program reads 1; update it"),
-        ({"version": "1"}, "of version"),
+        ({"version": "1"}, "of version '1', and this program reads 1"),
         ({"version": True}, "of version"),
         ({"version": None}, "of version"),
         ({"format": "foo"}, "says that it is 'foo'"),

@@ -13,6 +13,7 @@ from format_rigs import format_rig, lens, pixels, points_before, worst_pose_diff
 
 from aruco.errors import InputError
 from aruco.pose_math import Pose, invert_transform, transform_points
+from rigcal.formats import registry
 from rigcal.formats.nerfstudio import FORMAT
 from rigcal.formats.rig import ExportOptions, Rig, y_up
 
@@ -249,3 +250,14 @@ def test_a_camera_model_that_is_no_word_is_refused(model: object, tmp_path: Path
     path.write_text(json.dumps({**content, "camera_model": model}))
     with pytest.raises(InputError, match="no counterpart"):
         FORMAT.read(path)
+
+
+def test_what_cannot_be_one_is_told_what_is_wanted(tmp_path: Path) -> None:
+    path = tmp_path / "file.json"
+    head = '{"frames": [{"transform_matrix": 1}], "x": "'
+    for text, words in ((head + "x" * 2**24, "over 16 MiB, which is not"), (head, "not a JSON file .*; give")):
+        for mark in ("", "\ufeff"):
+            path.write_text(mark + text, encoding="utf-8")
+            with pytest.raises(InputError, match=f"{words} a transforms.json of nerfstudio") as caught:
+                registry.read_rig(path)
+            assert "extrinsics" not in str(caught.value)

@@ -146,3 +146,14 @@ def test_what_is_wrong_is_said_with_its_place(
     with pytest.raises(InputError, match=words) as caught:
         registry.read_rig(path)
     assert str(path) in str(caught.value)
+
+
+def test_what_cannot_be_one_is_told_what_is_wanted(tmp_path: Path) -> None:
+    path = tmp_path / "file.json"
+    head = '{"class_name": "PinholeCameraTrajectory", "x": "'
+    for text, words in ((head + "x" * 2**24, "over 16 MiB, which is not"), (head, "not a JSON file .*; give")):
+        for mark in ("", "\ufeff"):
+            path.write_text(mark + text, encoding="utf-8")
+            with pytest.raises(InputError, match=f"{words} a camera trajectory as Open3D writes it") as caught:
+                registry.read_rig(path)
+            assert "extrinsics" not in str(caught.value)

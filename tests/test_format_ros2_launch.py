@@ -235,6 +235,19 @@ def test_a_camera_on_a_computed_frame_is_refused(tmp_path: Path):
         FORMAT.read(path)
 
 
+@pytest.mark.parametrize("x", ["$(eval '(1+2)/1000')", "$(eval '((1)+(2))' $(var (y)))", "$(var x)$(var y)"])
+@pytest.mark.parametrize("camera", ["a_optical_frame", "a_link"])
+def test_a_computed_publisher_of_something_else_does_not_matter_in_xml(
+    tmp_path: Path, x: str, camera: str, said: list[str]
+):
+    path = tmp_path / "rig.launch.xml"
+    node = '<node pkg="tf2_ros" exec="static_transform_publisher" args="--x {} --frame-id {} --child-frame-id {}"/>'
+    nodes = node.format("1", "world", camera) + node.format(x, "base", "imu")
+    path.write_text(f"<launch>{nodes}</launch>")
+    assert list(FORMAT.read(path).T_world_cam) == [camera.removesuffix("_optical_frame")]
+    assert any("imu have no place that is known" in line for line in said) == (camera == "a_link")
+
+
 def test_cameras_that_hang_from_another_one_know_no_up(tmp_path: Path, said: list[str]):
     between = ["--x", "0.5", "--frame-id", "left_optical_frame", "--child-frame-id", "right_optical_frame"]
     rig = FORMAT.read(launch_of(tmp_path, between))

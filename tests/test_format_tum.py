@@ -11,6 +11,7 @@ from format_rigs import format_rig, pixels, points_before, worst_pose_difference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from loguru import logger
+from scipy.spatial.transform import Rotation
 
 from aruco.errors import InputError
 from aruco.model import UpAxis
@@ -128,6 +129,10 @@ def test_a_file_that_was_cut_anywhere_is_refused_or_told(tmp_path: Path) -> None
         ("7.07107e-01 0.0 0.0 7.07107e-01", True),
         ("0.7071067811865476 0.0 0.0 0.707", True),
         ("0.7071067811865476 0.0 0.0 0.70", False),
+        ("0.018 0.020 0.000 1.000", True),
+        ("0.50 0.50 0.500 0.500", True),
+        ("0.500 0.500 0.500 0.49", False),
+        ("1e-99999999999999999999999 0 0 1", True),
     ],
 )
 def test_a_quaternion_is_as_long_as_its_digits_allow(quaternion: str, is_whole: bool, tmp_path: Path) -> None:
@@ -136,6 +141,19 @@ def test_a_quaternion_is_as_long_as_its_digits_allow(quaternion: str, is_whole: 
     rig, said = said_of(path)
     assert (rig is not None) == is_whole
     assert is_whole or "line 2: the quaternion's length is 0." in said[0]
+
+
+@pytest.mark.parametrize("style", [".2f", ".3f", ".4f", ".2e", ".3e", ".2g", ".3g", ".4g"])
+@pytest.mark.parametrize("most_rad", [0.03, 0.1, 3.0])
+def test_few_digits_of_any_style_are_never_taken_for_damage(style: str, most_rad: float, tmp_path: Path) -> None:
+    """Of small turns too, whose w is 1.000, and whose x is 1.23e-05."""
+    rng = np.random.default_rng(4)
+    rotvecs = rng.normal(size=(1000, 3))
+    rotvecs *= (rng.uniform(0, most_rad, 1000) / np.linalg.norm(rotvecs, axis=1))[:, None]
+    values = Rotation.from_rotvec(rotvecs).as_quat()
+    lines = [f"{n} 0 0 0 {' '.join(f'{x:{style}}' for x in row)}\n" for n, row in enumerate(values)]
+    (tmp_path / "poses.txt").write_text("".join(lines))
+    assert len(FORMAT.read(tmp_path / "poses.txt").T_world_cam) == 1000
 
 
 @pytest.mark.parametrize("digits", [3, 4, 6, 9])

@@ -164,15 +164,55 @@ def test_a_tree_that_hangs_from_a_camera_keeps_both_cameras_and_knows_no_up(tmp_
         FORMAT.write(rig, tmp_path / "r.urdf", DEFAULT)
 
 
-@pytest.mark.parametrize("root", ["camera_link", "zed_camera_center", "cam0", "left_camera_frame", "rig/cam_1/base"])
+@pytest.mark.parametrize(
+    "root", ["camera_link", "zed_camera_center", "cam0", "left_camera_frame", "rig/cam_1/base", "camera_rig"]
+)
 def test_the_body_of_a_camera_is_no_upright_world(tmp_path: Path, root: str, said: list[str]):
     rig = FORMAT.read(urdf_of(tmp_path, joint_of(root, "a_optical_frame", xyz="1 2 3")))
     assert rig.up is None
     assert rig.T_world_cam["a"][:3, 3].tolist() == [1.0, 2.0, 3.0]
     assert root in said[0]
+    assert "if its z points up, rename it" in said[0]
 
 
-@pytest.mark.parametrize("root", ["world", "map", "base_link", "campus", "optical_table"])
+@pytest.mark.parametrize(
+    ("tree", "cameras"),
+    [
+        ({"cam1": "cam0", "cam2": "cam0"}, {"cam0": 0, "cam1": 1, "cam2": 1}),
+        ({"cam1": "cam0", "cam2": "cam1"}, {"cam0": 0, "cam1": 1, "cam2": 2}),
+        ({"cam1": "cam0_optical_frame", "cam2": "cam0_optical_frame"}, {"cam0": 0, "cam1": 1, "cam2": 1}),
+        ({"cam0": "cam0_optical_frame"}, {"cam0_optical_frame": 0, "cam0": 1}),
+        ({"rig/cam1": "rig/cam0"}, {"rig/cam0": 0, "rig/cam1": 1}),
+        # The body of a camera is none, nor is a link of an arm.
+        ({"cam0_lens": "cam0"}, {"cam0_lens": 1}),
+        ({"link1": "link0", "link2": "link1"}, {"link2": 2}),
+    ],
+)
+def test_a_camera_that_others_hang_from_is_a_camera_too(
+    tmp_path: Path, tree: dict[str, str], cameras: dict[str, int], said: list[str]
+):
+    body = "".join(joint_of(parent, child, xyz="0 0 1") for child, parent in tree.items())
+    rig = FORMAT.read(urdf_of(tmp_path, body))
+    # How far along z: the world is the root's frame, or y up of it.
+    assert {name: np.abs(T[:3, 3]).max() for name, T in rig.T_world_cam.items()} == cameras
+    told = " ".join(said)
+    assert all(frame in told for frame in (*tree, *tree.values()) if frame.startswith(("cam", "rig")))
+
+
+def test_ends_that_move_are_left_out_beside_those_that_do_not(tmp_path: Path, said: list[str]):
+    body = joint_of("world", "a_link") + joint_of("world", "arm", kind="revolute") + joint_of("arm", "tool")
+    assert list(FORMAT.read(urdf_of(tmp_path, body)).T_world_cam) == ["a_link"]
+    assert "tool have no place that is known and fixed, and are left out" in said[0]
+    body = joint_of("world", "cam0") + joint_of("world", "cam1", kind="revolute") + joint_of("cam1", "cam1_lens")
+    assert list(FORMAT.read(urdf_of(tmp_path, body)).T_world_cam) == ["cam0"]
+    assert "cam1 are left out" in said[-1]
+    with pytest.raises(InputError, match="tool hangs on arm, which moves"):
+        FORMAT.read(urdf_of(tmp_path, joint_of("world", "arm", kind="revolute") + joint_of("arm", "tool")))
+
+
+@pytest.mark.parametrize(
+    "root", ["world", "map", "base_link", "campus", "optical_table", "cam_world", "camera_map", "mocapcam"]
+)
 def test_another_root_is_believed_to_have_z_up(tmp_path: Path, root: str, said: list[str]):
     rig = FORMAT.read(urdf_of(tmp_path, joint_of(root, "a_optical_frame", xyz="1 2 3")))
     assert rig.up == "+y"

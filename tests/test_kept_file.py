@@ -14,7 +14,8 @@ from aruco.errors import CalibrationError, InputError
 from aruco.model import Calibration, CameraPose
 from aruco.pose_math import pose_text
 from rigcal.formats.native import document, write_extrinsics
-from rigcal.kept import KeptRig, kept_from_file
+from rigcal.formats.native_rig import FORMAT
+from rigcal.kept import NOTHING_KEPT, KeptRig, kept_from_file
 from rigcal.report.terminal import show_calibration
 
 POSE = pose_text(np.eye(4))
@@ -87,9 +88,12 @@ def test_a_kept_pose_is_written_as_it_was_read(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "new.json").read_text())["x"]["pose"] == NEGATIVE_ZERO
 
 
-def test_a_world_that_says_nothing_has_its_origin_in_a_camera(tmp_path: Path) -> None:
-    rig = kept(tmp_path, f'{{"x": {entry()}}}')
-    assert (rig.up, rig.origin) == (None, "camera")
+def test_nobody_knows_what_a_world_that_does_not_say_it_is_tied_to(tmp_path: Path) -> None:
+    for meta in ("{}", '{"world": null}', '{"world": {}}', '{"world": {"up": null}}'):
+        rig = kept(tmp_path, f'{{"x": {entry()}, "_meta": {meta}}}')
+        assert (rig.up, rig.origin) == (None, "unknown")
+        assert FORMAT.read(tmp_path / "old.json").origin == rig.origin  # whichever command reads it
+    assert NOTHING_KEPT.origin == "target"
     rig = kept(tmp_path, f'{{"x": {entry()}, "_meta": {{"world": {{"up": [0.0, -1.0, 0.0], "origin": "floor"}}}}}}')
     assert (rig.up, rig.origin) == ("-y", "floor")
 

@@ -125,7 +125,16 @@ def read(path: Path) -> Rig:
         cameras[name] = camera_of_model(name, model, width, height, parameters, line)
     if not poses:
         raise InputError(f"{path / IMAGES}: holds no image; give {WHAT}.")
-    _say_missing(path, {_last(prefix) for prefix in prefixes} - poses.keys(), lenses.keys() - used)
+    known = {_last(prefix) for prefix in prefixes}
+    _say_missing(path, known - poses.keys(), lenses.keys() - used)
+    if known and (others := listed(poses.keys() - known)):
+        logger.warning(
+            "{}: camera {}, called after the folder of its images, is not in {}; if {} was cut short, copy it again",
+            path / IMAGES,
+            others,
+            RIG,
+            IMAGES,
+        )
     return Rig(T_world_cam=poses, cameras=cameras)
 
 
@@ -203,14 +212,18 @@ def _prefixes(path: Path) -> list[str]:
 
 
 def _camera_name(image: str, prefixes: list[str], where: str) -> str:
-    """The camera that took an image: by its folder; by the image's own name where it has none."""
-    folder = next((prefix for prefix in prefixes if image.startswith(prefix)), None)
-    if folder is None and prefixes:
+    """The camera that took an image: by its folder, also where the rig configuration has none such.
+
+    Raises:
+        InputError: It lies in no folder, where a rig configuration says that cameras have some.
+    """
+    folder = next((prefix for prefix in prefixes if image.startswith(prefix)), image.rpartition("/")[0])
+    if prefixes and not _last(folder):
         raise InputError(
             f"{where}: image {image[:80]!r} is of no camera in {RIG}, which has {listed(map(_last, prefixes))}; copy "
             f"the folder again if {IMAGES} was cut short, else mend or remove {RIG}."
         )
-    name = _last(image.rpartition("/")[0] if folder is None else folder) or Path(image).stem
+    name = _last(folder) or Path(image).stem
     check_name(name, where)
     return name
 

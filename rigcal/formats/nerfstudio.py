@@ -41,6 +41,7 @@ from rigcal.formats.rig import (
 from rigcal.formats.rotations import nearest_rotation, rigid_pose, steady
 
 NAME = "nerfstudio"
+WHAT = "a transforms.json of nerfstudio"
 DEFAULT_PATTERN = "{camera}.png"
 # nerfstudio's names of the coefficients, in OpenCV's order.
 _PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3")
@@ -110,10 +111,10 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
 
 def read(path: Path) -> Rig:
     """Read the file; every frame is a camera. See Format.read."""
-    content = read_json(path)
+    content = read_json(path, WHAT)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(f"{path}: lists no frames; give a transforms.json of nerfstudio.")
+        raise InputError(f"{path}: lists no frames; give {WHAT}.")
     up, R_world_file, scale = _world(content, path)
     poses: dict[str, Pose] = {}
     cameras: dict[str, Camera] = {}

@@ -32,6 +32,7 @@ from rigcal.formats.rig import (
 from rigcal.formats.rotations import rigid_pose, steady
 
 TRAJECTORY, PARAMETERS = "PinholeCameraTrajectory", "PinholeCameraParameters"
+WHAT = "a camera trajectory as Open3D writes it"
 _VERSION = {"version_major": 1, "version_minor": 0}
 
 
@@ -80,7 +81,7 @@ def read(path: Path) -> Rig:
     Raises:
         InputError: The file cannot be read, or an entry is not what it should be.
     """
-    content = native.read_json(path)
+    content = native.read_json(path, WHAT)
     entries = _entries(content, path)
     poses: dict[str, Pose] = {}
     for name, entry in entries.items():
@@ -92,14 +93,14 @@ def read(path: Path) -> Rig:
 
 def read_cameras(path: Path) -> Mapping[str, Camera]:
     """Intrinsics only."""
-    return _cameras(_entries(native.read_json(path), path), path)
+    return _cameras(_entries(native.read_json(path, WHAT), path), path)
 
 
 def _entries(content: Mapping[str, Any], path: Path) -> dict[str, Mapping[str, Any]]:
     """Name -> parameters."""
     given = [content] if content.get("class_name") == PARAMETERS else content.get("parameters")
     if not isinstance(given, list) or not given or not all(isinstance(entry, dict) for entry in given):
-        raise InputError(f"{path}: has no list of camera parameters; give a trajectory as Open3D writes it.")
+        raise InputError(f"{path}: has no list of camera parameters; give {WHAT}.")
     names = [word(entry.get("name")) or numbered_name(index) for index, entry in enumerate(given)]
     if len(set(names)) < len(names):
         raise InputError(f"{path}: two cameras have one name; rename one of them.")
@@ -122,7 +123,7 @@ def _cameras(entries: Mapping[str, Mapping[str, Any]], path: Path) -> dict[str, 
 def _camera(name: str, entry: Mapping[str, Any], where: str) -> Camera:
     given = entry.get("intrinsic")
     if not isinstance(given, dict):
-        raise InputError(f"{where} has no intrinsic; give a trajectory as Open3D writes it.")
+        raise InputError(f"{where} has no intrinsic; give {WHAT}.")
     width, height = whole(given.get("width"), f"{where}: width"), whole(given.get("height"), f"{where}: height")
     K = numbers(given.get("intrinsic_matrix"), f"{where}: intrinsic_matrix", 9).reshape(3, 3, order="F")
     model: DistortionModel = entry.get("distortion_model", "plumb_bob")

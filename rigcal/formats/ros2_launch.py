@@ -36,10 +36,7 @@ _FRAMES = ("--frame-id", "--child-frame-id")
 _UNFLAGGED = {8: (*_XYZ, "--yaw", "--pitch", "--roll", *_FRAMES), 9: (*_XYZ, *_XYZW, *_FRAMES)}
 # ROS 1's tf, not its tf2_ros, wants a period [ms] after them.
 _WITH_PERIOD = (9, 10)
-# $(var x) in XML; inner ones first, as deep as anybody writes.
-_SUBSTITUTION = re.compile(r"\$\([^()]*\)")
-_MAX_NESTED = 8
-# What stands for one in the meantime: no XML holds it.
+# What stands for a $(var x) in the meantime: no XML holds it.
 _COMPUTED = "\0"
 _NOT_RUN = "computed, and a launch file is not run here"
 # A word of a publisher's arguments; None: it is computed.
@@ -152,15 +149,31 @@ def _in_xml(text: str, path: Path) -> Iterator[tuple[str, Sequence[Word]]]:
     root = parsed_xml(text, path, _WHAT)
     nodes = (node for node in root.iter("node") if node.get("exec", node.get("type")) == PROGRAM)
     for nth, node in enumerate(nodes, start=1):
-        where, said = f"{path}: {PROGRAM} {nth}", node.get("args", "")
-        for _ in range(_MAX_NESTED):
-            said = _SUBSTITUTION.sub(_COMPUTED, said)
+        where, said = f"{path}: {PROGRAM} {nth}", _unsubstituted(node.get("args", ""))
         try:
             arguments = [None if _COMPUTED in word else word for word in shlex.split(said)]
         except ValueError as error:
             raise InputError(f"{where}: its args cannot be parted ({error}); mend them.") from error
         has_period = node.get("pkg") == "tf" and len(arguments) in _WITH_PERIOD
         yield where, arguments[:-1] if has_period else arguments
+
+
+def _unsubstituted(said: str) -> str:
+    """The text with a sign for every $(...) that closes, whatever parentheses stand inside: $(eval '(1 + 2) / 3')."""
+    kept, at = "", 0
+    while (start := said.find("$(", at)) >= 0 and (end := _closed(said, start + 1)):
+        kept, at = f"{kept}{said[at:start]}{_COMPUTED}", end
+    return kept + said[at:]
+
+
+def _closed(said: str, start: int) -> int | None:
+    """Where what follows the parenthesis begins that opens at ``start``; None: it does not close."""
+    depth = 0
+    for at in range(start, len(said)):
+        depth += {"(": 1, ")": -1}.get(said[at], 0)
+        if depth == 0:
+            return at + 1
+    return None
 
 
 def _in_python(text: str, path: Path) -> Iterator[tuple[str, Sequence[Word]]]:

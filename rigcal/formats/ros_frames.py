@@ -38,7 +38,10 @@ _DEFAULT_PATTERNS = (
     "{camera}_frame_optical",
 )
 # zed_camera_link, cam0, camera_color_optical_frame: bodies that are mounted at any tilt.
-_CAMERAS_OWN = re.compile("(^|[_/])cam(era)?[0-9]*($|[_/])|(^|[_/])optical(_frame)?$", re.IGNORECASE)
+# What is called a world or a map is none of them, whoever made it: cam_world.
+_CAMERAS_OWN = re.compile(
+    "(?!(.*[_/])?(world|map)$)(.*[_/])?cam(era)?[0-9]*($|[_/])|(.*[_/])?optical(_frame)?$", re.IGNORECASE
+)
 # What comes back as another sign: such parts of names are spelt too.
 _LIKE_SPELT = "_(?=x[0-9a-f]{1,6}(?:_|[^A-Za-z0-9_]))"
 MOVES = "moves; give a file with fixed cameras"
@@ -144,10 +147,10 @@ def rig_of(links: Mapping[str, Link], text: str, path: Path) -> Rig:
     if len(roots := {root for root, _ in placed.values()}) > 1:
         raise InputError(f"{path}: its cameras hang from several roots ({listed(roots)}); give a file with one world.")
     # A file of ours says that its root has z up, whatever that is called.
-    if not ours and _CAMERAS_OWN.search(root := roots.pop()):
+    if not ours and _CAMERAS_OWN.match(root := roots.pop()):
         logger.warning(
-            "{}: its frames hang from {}, a camera's, which may be tilted, so which way is up stays unknown; a root "
-            "called world or map is taken to have z up",
+            "{}: its frames hang from {}, a camera's by its name, which may be tilted, so which way is up stays "
+            "unknown; if its z points up, rename it: a root called world or map is taken to have z up",
             path,
             root,
         )
@@ -167,7 +170,7 @@ def _named_by(pattern: str, frames: Iterable[str]) -> dict[str, str]:
 
 
 def _cameras(links: Mapping[str, Link], path: Path) -> dict[str, str]:
-    """Camera -> frame: by the usual endings, else all ends of the tree; its root too, where that is a camera."""
+    """Camera -> frame: by the usual endings, else all ends of the tree, and what is named like these or as optical."""
     parents = {link.parent for link in links.values()}
     roots = sorted(parents - links.keys())
     for pattern in _DEFAULT_PATTERNS:
@@ -175,16 +178,46 @@ def _cameras(links: Mapping[str, Link], path: Path) -> dict[str, str]:
         if links.keys() & set(found.values()):
             _say_left_out({*links, *roots} - set(found.values()), pattern, path)
             return found
-    ends = {frame: frame for frame in links if frame not in parents}
-    if not ends:
+    if not (ends := links.keys() - parents):
         raise InputError(f"{path}: holds no frame of a camera; give a file with a transform for each camera.")
-    ends |= {root: root for root in roots if _is_optical(root)}
+    fixed = {end for end in ends if _is_fixed(end, links)}
+    if fixed and (loose := listed(ends - fixed)):
+        logger.warning("{}: {} have no place that is known and fixed, and are left out", path, loose)
+    taken = {frame: frame for frame in fixed or ends}
+    alike = {_without_number(frame) for frame in taken}
+    others = {frame for frame in parents if _CAMERAS_OWN.match(frame)}
+    taken |= {frame: frame for frame in others if _without_number(frame) in alike and _is_fixed(frame, links)}
+    taken |= {_named_alone(root, taken): root for root in roots if _is_optical(root)}
     logger.warning(
-        "{}: no frame is named as an optical one; {} are taken for cameras with z forward, x right, y down",
+        "{}: no frame that hangs on another is named as an optical one; {} are taken for cameras with z forward, x "
+        "right, y down{}",
         path,
-        listed(ends),
+        listed(taken.values()),
+        f"; {rest} are left out" if (rest := listed(others - set(taken.values()))) else "",
     )
-    return ends
+    return taken
+
+
+def _is_fixed(frame: str, links: Mapping[str, Link]) -> bool:
+    """Whether every link above a frame is known; what has no end is found later."""
+    for _ in range(MAX_DEPTH):
+        if frame not in links:
+            return True
+        if links[frame].T_parent_child is None:
+            return False
+        frame = links[frame].parent
+    return True
+
+
+def _without_number(frame: str) -> str:
+    """cam0 and cam1 are of one kind, cam0 and cam0_imu are not."""
+    return re.sub("[0-9]+", "", frame)
+
+
+def _named_alone(frame: str, taken: Iterable[str]) -> str:
+    """The camera of an optical frame, which is called as the frame where the name is another's."""
+    names = (camera_of(frame, pattern) for pattern in _DEFAULT_PATTERNS)
+    return next((name for name in names if name and name not in taken), frame)
 
 
 def _say_left_out(frames: Iterable[str], pattern: str, path: Path) -> None:

@@ -24,8 +24,8 @@ MAX_FILE_BYTES = 2**20  # some thousand cameras
 _CAMERA = re.compile(r'#\s*camera:\s*(".*")\s*')
 _UP = re.compile(r"^[ \t]*#[ \t]*world_up:[ \t]*([-+]y)[ \t\r]*$", re.MULTILINE)
 _COUNT = re.compile(r"^[ \t]*#[ \t]*cameras:[ \t]*([0-9]{1,6})[ \t\r]*$", re.MULTILINE)
-# A quaternion of n digits is as long as one but for 1e-n: four numbers, each half a digit off. Twice that for programs
-# that cut digits off instead of rounding. Programs that write more than four digits need not be as exact as those.
+# A quaternion of n decimals is as long as one but for 1e-n: four numbers, each half a digit off. Twice that for
+# programs that cut digits off instead of rounding. Programs that write more than four need not be as exact as those.
 _MOST_DIGITS = 4
 
 
@@ -134,9 +134,14 @@ def _pose(text: str, where: str) -> Pose:
     return make_pose(R, values[1:4])
 
 
-def _digits(word: str) -> int:
-    """How many digits a number states, zeros in front left out."""
-    return len(word.lower().partition("e")[0].lstrip("+-0.").replace(".", ""))
+def _digits(word: str) -> float:
+    """After which digit behind the point a number was rounded, as far as it can tell.
+
+    A small one, 0.00012 or 1.2e-04, may have been rounded to so many digits, not decimals: larger ones have fewer.
+    """
+    mantissa, _, exponent = word.lower().partition("e")
+    decimals = len(mantissa.partition(".")[2]) - float(exponent or 0)  # an int takes only some thousand digits
+    return min(decimals, len(mantissa.lstrip("+-0.").replace(".", "")))
 
 
 def recognises(path: Path, head: bytes) -> bool:
