@@ -129,6 +129,7 @@ class BadFrame:
     camera: str
     stamp_ns: int
     reason: str
+    depth_may_be_why: bool = False  # then the image may be readable alone
 
 
 def name_trouble(name: str) -> str:

@@ -53,9 +53,10 @@ class CalibrateOutputs:
             report=given["report_csv"],
             verify=given["verify_depth"],
         )
+        begins = {outputs.poses: b"{", outputs.depth: b"\x89HDF", outputs.marker_map: b"PAR1"}
         for path in outputs.paths:
             refuse_inputs(path, [*given["svo"], *given["inputs"]], given["markers"], given["fix"])
-            check_writable(path)
+            check_writable(path, begins.get(path, b""))
         refuse_clashes(outputs.paths)
         return outputs
 

@@ -83,7 +83,7 @@ def _frames_of(
 ) -> Iterator[Frame | BadFrame]:
     """A camera's frames; where depth is what cannot be read the image comes alone, and is counted."""
     for index, frame in zip(indices, recording.frames(camera, indices, depth=depth)):
-        if depth and isinstance(frame, BadFrame):
+        if isinstance(frame, BadFrame) and frame.depth_may_be_why:
             (alone,) = recording.frames(camera, [index])
             if isinstance(alone, Frame):
                 if not depthless[camera]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aruco.atomic import check_writable, write_whole
+from aruco.atomic import check_writable, part_of, write_all_whole
 from aruco.errors import OutputError
 from rigcal.cli import beside, refuse_clashes
 from rigcal.formats import native
@@ -45,9 +45,10 @@ class LevellingOutputs:
                 if path.resolve() == given[option].resolve():
                     flag = option.replace("_", "-")
                     raise OutputError(f"{path}: is --{flag}, an input, which is never changed; choose another name.")
-        refuse_clashes(outputs.paths)
+        # What is written first must not replace what is still being written either.
+        refuse_clashes([*outputs.paths, *(part_of(path.resolve()) for path in outputs.paths)])
         for path in outputs.paths:
-            check_writable(path)
+            check_writable(path, b"<" if path == page else b"{")
         return outputs
 
     @property
@@ -70,25 +71,7 @@ class LevellingOutputs:
         if self.page is not None:
             contents[self.page] = _page(levelling).encode()
         contents[self.poses] = native.json_bytes(levelling.content)
-        _write_all(contents)
-
-
-def _write_all(contents: Mapping[Path, bytes]) -> None:
-    """Beside their goals first, so that a full disk leaves nothing behind; then in their order."""
-    goals = {path: path.resolve() for path in contents}
-    staged = {path: goal.with_name(f"{goal.name}.new") for path, goal in goals.items()}
-    try:
-        for path, data in contents.items():
-            write_whole(staged[path], data)
-        for path, goal in goals.items():
-            staged[path].replace(goal)
-    except OSError as error:
-        raise OutputError(
-            f"The outputs cannot be written ({error.strerror or error}); choose another place."
-        ) from error
-    finally:
-        for part in staged.values():
-            part.unlink(missing_ok=True)
+        write_all_whole(contents)
 
 
 def _page(levelling: Levelling) -> str:

@@ -78,7 +78,7 @@ class Source:
         if camera == "grey" or not depth:
             return Frame(camera=camera, stamp_ns=stamp, image=image)
         if index in self.bad_depth:
-            return BadFrame(camera, stamp, "has torn depth")
+            return BadFrame(camera, stamp, "has torn depth", depth_may_be_why=True)
         metres = rng.uniform(0.5, 5.0, (H, W))
         if self.depth_step_m is not None:
             metres = np.rint(metres / self.depth_step_m) * self.depth_step_m
@@ -204,6 +204,8 @@ def test_an_image_is_kept_where_only_its_depth_cannot_be_read(
         f"camera 1234: frame {source.stamps_ns('1234')[bad_depth[0]]} is written without depth, as are all like it: "
         "has torn depth"
     ]
+    # Each once, and the first of each camera, to know the recording by; again where depth may be why.
+    assert len(source.reads) == 12 + 2 + lost
     recording = open_recordings([tmp_path / name])
     assert_same(recording, source, depth=False, skip=(1,))
     with_depth = recording.stamps_ns("1234")[recording.depth_indices("1234")]

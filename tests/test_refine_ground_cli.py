@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -41,6 +41,7 @@ from level_runs import (
     store_of,
 )
 
+from aruco import atomic
 from aruco.depth_bias import DepthBias
 from aruco.depth_save import save_depth_data
 from aruco.errors import OutputError
@@ -455,6 +456,26 @@ def test_a_file_of_bare_poses_is_read_with_y_up_and_a_warning(rig: Path, store: 
     assert content["_meta"]["ground_refined"]["up_is_assumed"]
 
 
+@pytest.mark.parametrize(
+    ("world", "advice"),
+    [
+        # Nobody can align the rig of another program again.
+        ({"up": None, "origin": "unknown"}, "if you know that +y of this world points up, write [0, 1, 0] for up"),
+        ({"up": None, "origin": "camera"}, "if you know that +y of this world points up, write [0, 1, 0] for up"),
+        ({"up": None}, "if you know that +y of this world points up, write [0, 1, 0] for up"),
+        ({"up": None, "origin": "target"}, "run calibrate-extrinsics again with --auto-align"),
+    ],
+)
+def test_what_to_do_about_a_world_of_unknown_up_fits_whose_it_is(
+    world: dict[str, Any], advice: str, rig: Path, store: Path, tmp_path: Path
+) -> None:
+    change(rig, lambda c: c["_meta"].update(world=world))
+    assert_one_sentence(level(rig, store, tmp_path / "out.json"), advice)
+    # The advice helps.
+    change(rig, lambda c: c["_meta"]["world"].update(up=[0, 1, 0]))
+    assert level(rig, store, tmp_path / "out.json").exit_code == 0
+
+
 def test_the_floor_contradicts_a_wrong_guess_of_up(rig: Path, store: Path, tmp_path: Path) -> None:
     upside_down = {name: TURN @ T for name, T in given_poses().items()}
     rig.write_text(json.dumps({name: {"pose": pose_text(T)} for name, T in upside_down.items()}))
@@ -679,13 +700,42 @@ def test_outputs_never_replace_an_input_or_each_other(rig: Path, store: Path, tm
 def test_a_run_that_cannot_write_everything_leaves_nothing(
     rig: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, data: bytes) -> None:
-        if ".html" in path.name:
-            raise OutputError(f"{path}: cannot be written (No space left on device); choose another place.")
-        path.write_bytes(data)
+    new_part = atomic._new_part
 
-    monkeypatch.setattr(levelling_outputs, "write_whole", full)
+    def full(path: Path, goal: Path) -> BinaryIO:
+        if path.suffix == ".html":
+            raise OutputError(f"{path}: cannot be written (No space left on device); choose another place.")
+        return new_part(path, goal)
+
+    monkeypatch.setattr(atomic, "_new_part", full)
     refused(rig, store, tmp_path, "No space left")
+
+
+@pytest.mark.parametrize("option", ["-o", "--metrics-json", "--plot-output"])
+def test_what_a_killed_run_has_left_is_found_before_the_work(
+    option: str, rig: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left: list[Path] = []
+
+    def killed(self: Path, goal: Path) -> None:
+        left.append(self)
+        raise SystemExit(9)
+
+    goal = tmp_path / "goal.json"
+    out, more = (goal, ()) if option == "-o" else (tmp_path / "out.json", (option, goal))
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", killed)
+        patched.setattr(atomic, "_try_remove", lambda path: None)
+        assert level(rig, store, out, *more).exit_code == 9
+    assert left
+    monkeypatch.setattr(levelling_outputs.LevellingOutputs, "write", lambda *_: pytest.fail("found after the work"))
+    assert_one_sentence(level(rig, store, out, *more), "is in the way")
+
+
+def test_an_output_that_is_another_one_in_the_making_is_refused(rig: Path, store: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    said = level(rig, store, out, "--metrics-json", tmp_path / "out.json.part")
+    assert_one_sentence(said, "two outputs")
 
 
 def test_a_table_in_a_world_that_has_its_floor_already_is_doubted(rig: Path, tmp_path: Path) -> None:

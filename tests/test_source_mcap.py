@@ -94,7 +94,7 @@ def test_of_a_file_cut_off_anywhere_what_is_whole_is_read(compression: str, chun
         before = len(found)
         if len(found) < N:
             assert index.loss is not None
-            assert "is cut off: the record at byte" in index.loss
+            assert "is cut off or damaged: the record at byte" in index.loss
             # Of what does not compress at most the message at the cut, and what its compression holds back, is lost.
             if compression != "ZSTD":
                 assert len(found) >= size // (SIZE_BYTES + 200) - (1 if compression == "NONE" else 10)
@@ -351,7 +351,7 @@ def test_a_cut_off_recording_is_used_and_told(tmp_path: Path, said: list[str]):
     recording = open_recordings([path])
     assert len(recording.stamps_ns("cam")) == 2
     assert [(frame.width, frame.height) for frame in recording.cameras] == [SIZE]
-    assert any(line.startswith(f"{path}: is cut off: the record at byte") for line in said)
+    assert any(line.startswith(f"{path}: is cut off or damaged: the record at byte") for line in said)
 
 
 class Forgetful(ChunkedFile):

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_writers import SIZE, K, Message, Ros, pictures, write_mcap
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 
 from aruco.errors import InputError
 from aruco.model import BadFrame, Camera, Frame
 from rigcal.sources import open_recordings
+from rigcal.sources.mcap_writer import McapFrames
 from rigcal.sources.message_store import Topic, plain_type
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.ros_streams import First
@@ -230,6 +234,22 @@ def test_namespaces_may_be_called_like_streams(above: str):
         assert camera.depth == f"{above}/{side}/aligned_depth_to_color/image_raw"
 
 
+@pytest.mark.parametrize("rows", [REALSENSE, ZED], ids=["realsense", "zed"])
+@pytest.mark.parametrize("above", ["", "/rig"])
+def test_namespaces_called_like_streams_may_have_others_below(above: str, rows: Sequence[tuple[str, str, str]]):
+    """/left/camera/color and /right/camera/color, which may have the same frames."""
+    all_rows = []
+    for side in ("left", "right"):
+        all_rows += [(f"{above}/{side}/{topic.split('/', 2)[2]}", kind, frame) for topic, kind, frame in rows]
+    found = cameras(all_rows)
+    assert len(found) == 2
+    (alone,) = cameras(rows).values()
+    for side, camera in zip(("left", "right"), found.values()):
+        for topic, wanted in ((camera.image, alone.image), (camera.depth, alone.depth), (camera.info, alone.info)):
+            assert wanted is not None
+            assert topic == f"{above}/{side}/{wanted.split('/', 2)[2]}"
+
+
 def test_plain_cameras_called_left_and_right_have_their_own_depth():
     rows = []
     for side in ("left", "right"):
@@ -257,6 +277,20 @@ def test_the_newest_zed_drivers_left_images_are_no_namespace():
     assert camera.right_info == "/zed/zed_node/right/color/rect/camera_info"
 
 
+def test_grey_and_side_by_side_images_of_a_zed_are_no_cameras(said: list[str]):
+    rows, node = list(ZED), "/zed/zed_node"
+    for eye, info in (("rgb", "info"), ("left", "info"), ("right", "eye")):
+        for way in ("rect", "raw"):
+            stream = f"{node}/{eye}{'_raw' if way == 'raw' else ''}_gray"
+            frame = "right" if eye == "right" else "left"
+            rows += [(f"{stream}/image_{way}_gray", "mono8", frame), (f"{stream}/camera_info", info, frame)]
+    for image in ("stereo/image_rect_color", "stereo_raw/image_raw_color", "stereo/color/rect/image"):
+        rows.append((f"{node}/{image}", "bgra8", "left"))
+    found = cameras(rows)
+    assert {name: camera.image for name, camera in found.items()} == {"zed": f"{node}/left/image_rect_color"}
+    assert said == []
+
+
 @pytest.mark.parametrize(
     "namespaces", [("color", "left", "right"), ("oak/rgb", "oak/left", "oak/right"), ("rgb/north", "rgb/south")]
 )
@@ -267,19 +301,45 @@ def test_images_of_frames_and_camera_infos_of_their_own_are_cameras(namespaces: 
     }
 
 
-def test_colour_beside_two_eyes_is_one_camera():
+def test_colour_is_a_camera_beside_left_and_the_second_of_two_eyes_is_none():
     rows = [*plain("oak/rgb", "oak/left"), ("/oak/right/image_raw", "bgr8", "right")]
     assert list(cameras([*rows, ("/oak/right/camera_info", "info", "right")])) == ["oak_left", "oak_rgb", "oak_right"]
-    found = cameras([*rows, ("/oak/right/camera_info", "eye", "right")])
-    assert "oak_right" not in found
+    assert list(cameras([*rows, ("/oak/right/camera_info", "eye", "right")])) == ["oak_left", "oak_rgb"]
+
+
+def test_depth_of_both_eyes_belongs_to_the_image_in_whose_frame_it_is(said: list[str]):
+    """As depthai publishes it."""
+    rows = [*plain("oak/rgb", "oak/left", "oak/right")]
+    rows += [("/oak/stereo/image_raw", "16UC1", "oak/rgb"), ("/oak/stereo/camera_info", "info", "oak/rgb")]
+    found = cameras(rows)
+    assert {name: camera.depth for name, camera in found.items()} == {
+        "oak_rgb": "/oak/stereo/image_raw",
+        "oak_left": None,
+        "oak_right": None,
+    }
+    assert found["oak_rgb"].depth_info == "/oak/stereo/camera_info"
+    assert said == []
+
+
+def test_a_pair_of_plain_cameras_may_be_called_stereo():
+    assert list(cameras(plain("stereo/left", "stereo/right"))) == ["stereo_left", "stereo_right"]
+    assert list(cameras(plain("stereo", "rgb"))) == ["rgb", "stereo"]
 
 
 def test_what_may_be_a_camera_of_its_own_is_not_left_out_in_silence(said: list[str]):
     assert list(cameras(plain("rgb", "ir"))) == ["camera"]
     assert said == [
-        "/ir/image_raw are taken for other images of the camera of /rgb/image_raw and left out; where they are cameras "
+        "/ir/image_raw is taken to be of the camera of /rgb/image_raw and left out; where these are several cameras "
         "name all with --topics NAME=IMAGE_TOPIC"
     ]
+
+
+@pytest.mark.parametrize("without", ["nothing", "/depth", "/rgb_to"])
+def test_infrared_of_a_single_kinect_is_nothing_to_warn_of(without: str, told: list[str], said: list[str]):
+    rows = [row for row in AZURE if not row[0].startswith(without)]
+    assert list(cameras(rows)) == ["camera"]
+    assert said == []
+    assert any(line.startswith("of one camera's images /rgb/image_raw is taken") and "/ir" in line for line in told)
 
 
 @pytest.mark.parametrize(
@@ -294,6 +354,7 @@ def test_what_may_be_a_camera_of_its_own_is_not_left_out_in_silence(said: list[s
         ("/cam/infra1/image_rect_raw", True),
         ("/zed/zed_node/rgb/color/rect/image", True),
         ("/cam/left_rect/image_raw", False),
+        ("/cam/image_raw_rect", True),
     ],
 )
 def test_only_a_streams_own_name_says_that_it_is_rectified(topic: str, rectified: bool):
@@ -446,6 +507,47 @@ def test_confidence_of_other_programs_spoils_no_depth(tmp_path: Path):
         assert frame.confidence is None
 
 
+def merged(out: Path, *paths: Path) -> Path:
+    """The messages of MCAP files in one."""
+    with out.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start("ros2")
+        for path in paths:
+            channels: dict[int, int] = {}
+            for schema, channel, message in make_reader(BytesIO(path.read_bytes())).iter_messages():
+                assert schema is not None
+                if channel.id not in channels:
+                    same = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.id] = writer.register_channel(channel.topic, "cdr", same, channel.metadata)
+                writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return out
+
+
+def test_cameras_of_drivers_are_read_beside_those_that_rigcal_wrote(tmp_path: Path):
+    """Of the latter the names are in metadata, and front_rect's images are not rectified."""
+    ros, messages, d = Ros(2), list[Message](), np.full(5, 0.1)
+    for name in ("left", "front"):
+        messages += [*images(ros, f"/{name}/image_raw", name), ros.info(f"/{name}/camera_info")]
+    frames = McapFrames(
+        tmp_path / "own.mcap",
+        [Camera(name=name, width=SIZE[0], height=SIZE[1], K=K, distortion=d) for name in ("front_rect", "123")],
+        (),
+    )
+    for name in ("front_rect", "123"):
+        frames.store(frames.packed(Frame(camera=name, stamp_ns=10**9, image=IMAGES[0])))
+    frames.finish()
+    both = merged(tmp_path / "both.mcap", tmp_path / "own.mcap", write_mcap(tmp_path / PATH, messages))
+    recording = open_recordings([both])
+    assert {camera.name: camera.has_distortion for camera in recording.cameras} == {
+        "123": True,
+        "front": False,
+        "front_rect": True,
+        "left": False,
+    }
+    assert [len(recording.stamps_ns(name)) for name in ("123", "front", "front_rect", "left")] == [1, 2, 1, 2]
+
+
 def test_without_camera_info_the_remedies_are_named(tmp_path: Path):
     with pytest.raises(InputError) as caught:
         opened(tmp_path, images(Ros(2)))
@@ -459,6 +561,37 @@ def test_a_camera_without_camera_info_is_left_out_beside_others(tmp_path: Path, 
     messages = [*images(ros, "/a/image_raw"), ros.info("/a/camera_info"), *images(ros, "/b/image_raw")]
     assert sorted(opened(tmp_path, messages)) == ["a"]
     assert any("/b/image_raw is left out, it has no CameraInfo" in line for line in told)
+
+
+@pytest.mark.parametrize(
+    ("info", "why"),
+    [
+        ({"k": np.zeros((3, 3))}, "its CameraInfo is empty (K is zero)"),
+        ({"size": (640, 480)}, "images are 64 x 48, but its CameraInfo says 640 x 480"),
+        ({"model": "double_sphere", "d": [0.5, 0.5]}, "the distortion model 'double_sphere' is not known"),
+    ],
+)
+def test_a_camera_of_unusable_camera_info_is_left_out_beside_others(
+    info: dict[str, object], why: str, tmp_path: Path, said: list[str]
+):
+    """As the eyes of an OAK whose colour camera alone is calibrated."""
+    ros, messages = Ros(2), list[Message]()
+    for name, fields in (("left", info), ("rgb", {}), ("right", info)):
+        messages += [*images(ros, f"/oak/{name}/image_raw", name), ros.info(f"/oak/{name}/camera_info", **fields)]  # type: ignore[arg-type]
+    assert list(opened(tmp_path, messages)) == ["oak_rgb"]
+    assert len(said) == 2
+    for line, name in zip(said, ("left", "right")):
+        assert line.startswith(f"{tmp_path / PATH}: /oak/{name}/image_raw is left out: camera oak_{name}: ")
+        assert why in line
+
+
+def test_where_all_camera_info_is_unusable_the_first_is_named(tmp_path: Path, said: list[str]):
+    ros, messages = Ros(2), list[Message]()
+    for name in "ab":
+        messages += [*images(ros, f"/{name}/image_raw", name), ros.info(f"/{name}/camera_info", k=np.zeros((3, 3)))]
+    with pytest.raises(InputError, match="camera a: its CameraInfo is empty"):
+        opened(tmp_path, messages)
+    assert said == []
 
 
 def test_intrinsics_that_change_are_told(tmp_path: Path, told: list[str]):

@@ -113,3 +113,36 @@ def test_a_folder_for_the_videos_beside_a_bag_does_not_matter_to_it(tmp_path: Pa
     assert len(open_recordings(paths, options).cameras) == 2
     with pytest.raises(InputError, match="no intrinsics there"):
         open_recordings(paths[:1], options)
+
+
+def rectified(folder: Path) -> Path:
+    ros, messages = Ros(2), list[Message]()
+    for topic in ("image_raw", "image_rect_color"):
+        messages += [ros.image(f"/cam/{topic}", 10**9 * (k + 1), i, "bgr8", "cam") for k, i in enumerate(IMAGES)]
+    p = np.hstack([K, np.zeros((3, 1))])
+    return write_mcap(folder / "cam.mcap", [*messages, ros.info("/cam/camera_info", d=[0.1] * 5, p=p)])
+
+
+def of_raw_images() -> dict[str, Camera]:
+    return {"cam": Camera(name="cam", width=SIZE[0], height=SIZE[1], K=GIVEN_K, distortion=np.full(5, 0.1))}
+
+
+def test_intrinsics_of_raw_images_are_not_those_of_rectified_ones(tmp_path: Path):
+    path = rectified(tmp_path)
+    with pytest.raises(InputError) as caught:
+        open_recordings([path], SourceOptions(intrinsics=FILE, read_cameras=lambda path: of_raw_images()))
+    assert (
+        f"{path}: rig.yaml: the intrinsics have distortion, but /cam/image_rect_color is rectified; name the raw "
+        "images with --topics cam=IMAGE_TOPIC"
+    ) in str(caught.value)
+    assert "/cam/image_raw (sensor_msgs/Image, 2)" in str(caught.value)
+    assert focal_lengths(path, given("cam")) == {"cam": 90}  # without distortion they may be
+
+
+@pytest.mark.parametrize(("topic", "warnings"), [("image_raw", 0), ("image_rect_color", 1)])
+def test_unless_the_user_names_the_images(topic: str, warnings: int, tmp_path: Path, said: list[str]):
+    options = SourceOptions(intrinsics=FILE, read_cameras=lambda path: of_raw_images(), topics=(f"cam=/cam/{topic}",))
+    (camera,) = open_recordings([rectified(tmp_path)], options).cameras
+    assert camera.has_distortion
+    assert len([line for line in said if "is rectified; they are used for it as named" in line]) == warnings
+    assert len(said) == warnings

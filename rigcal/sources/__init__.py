@@ -180,7 +180,7 @@ def _in_folder(path: Path) -> list[_Found]:
 
 
 def _tell_left_out(path: Path, inside: Sequence[_Found]) -> None:
-    """Name what looks like one more camera and is none."""
+    """Name what looks like one more camera and is none; raises InputError for a file, which is one that was lost."""
     from rigcal.sources.rgbd_folder import is_without_images
     from rigcal.sources.unknown import RECORDING_SUFFIXES, what_it_is
 
@@ -194,7 +194,7 @@ def _tell_left_out(path: Path, inside: Sequence[_Found]) -> None:
                 logger.warning("{}: is left out: it has camera_info.yaml but no image", child)
         elif child.suffix.lower() in RECORDING_SUFFIXES:
             why = what_it_is(child, _head(child)) if child.is_file() else "is no file that could be read"
-            logger.warning("{}: is left out: {}", child, why)
+            raise InputError(f"{child}: {why}, or move it out of the folder if it is no recording.")
 
 
 def _considered(path: Path) -> Iterator[Path]:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-# Decoders hand out several pictures at once where those refer to later ones.
-AHEAD = 3
+# More would take the memory of a picture each, for every camera that is read at the same time.
+AHEAD = 1
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 

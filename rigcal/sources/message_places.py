@@ -145,8 +145,8 @@ class IndexBuilder:
     def loss(self, at: int, size: int) -> str:
         """How a file of so many bytes ends that is cut off in the record at some byte; completes "<file> ..."."""
         return (
-            f"is cut off: the record at byte {at} of {size} is not whole; the {self._span_s():.3f} s of messages "
-            "before are used"
+            f"is cut off or damaged: the record at byte {at} of {size} is not whole; the {self._span_s():.3f} s of "
+            "messages before are used"
         )
 
     def _span_s(self) -> float:

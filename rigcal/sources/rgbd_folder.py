@@ -114,7 +114,7 @@ def _is_camera(path: Path) -> bool:
     if (path / FILE_NAME).is_file():
         return True
     # Of a recording that has a camera called image, that is not the folder of its images.
-    return (path / IMAGE).is_dir() and not (path / IMAGE / FILE_NAME).is_file()
+    return any((path / kind).is_dir() and not (path / kind / FILE_NAME).is_file() for kind in SUFFIXES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -197,7 +197,8 @@ class _CameraFolder:
             # Named from the camera on, so that the reason does not depend on where the recording lies.
             reason = f"{Path(*path.parts[-3:]).as_posix()} {error}"
             logger.debug("skipped: {}", reason)
-            return BadFrame(self.camera.name, stamp_ns, reason)
+            beside = path != self.image.path(index)
+            return BadFrame(self.camera.name, stamp_ns, reason, depth_may_be_why=beside)
         return Frame(
             camera=self.camera.name,
             stamp_ns=stamp_ns,

@@ -19,7 +19,7 @@ may be called like a stream. Images are as recorded, whatever they are called.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from rigcal.sources.message_store import READABLE, Topic
@@ -31,13 +31,8 @@ TYPES = ("CompressedImage", "CameraInfo", "Image", "CameraInfo", "Image")
 IMAGE, INFO, DEPTH, DEPTH_INFO, CONFIDENCE = range(len(TOPICS))
 
 
-def is_rigcals(topics: Mapping[str, Topic]) -> bool:
-    """Whether a recording has the layout."""
-    return bool(rigcal_cameras(topics))
-
-
 def rigcal_cameras(topics: Mapping[str, Topic]) -> tuple[CameraTopics, ...]:
-    """The cameras that rigcal wrote, sorted by name; topics of other programs beside theirs do not count."""
+    """The cameras that rigcal wrote, sorted by name."""
     cameras: list[CameraTopics] = []
     for image, topic in topics.items():
         if NAME_KEY in topic.about and image.endswith(f"/{TOPICS[IMAGE]}") and _there(topics, image):
@@ -55,6 +50,12 @@ def rigcal_cameras(topics: Mapping[str, Topic]) -> tuple[CameraTopics, ...]:
             )
             cameras.append(camera)
     return tuple(sorted(cameras, key=lambda camera: camera.name))
+
+
+def beside(topics: Mapping[str, Topic], cameras: Sequence[CameraTopics]) -> dict[str, Topic]:
+    """The topics outside of the namespaces of cameras that rigcal wrote: those of other programs."""
+    namespaces = tuple(camera.image.removesuffix(TOPICS[IMAGE]) for camera in cameras)
+    return {name: topic for name, topic in topics.items() if not name.startswith(namespaces)}
 
 
 def with_layout(topics: Mapping[str, Topic], camera: CameraTopics) -> CameraTopics:

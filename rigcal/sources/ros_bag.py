@@ -17,11 +17,13 @@ from loguru import logger
 
 from aruco.errors import InputError
 from aruco.model import Recording
+from rigcal.sources.mcap_records import MAGIC as MCAP_MAGIC
 from rigcal.sources.message_store import ChannelStore, MessageStore, SplitStore, Topic, ZstdMessages, plain_type
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.rosbag1_index import MAGIC, Rosbag1Index
 from rigcal.sources.rosbag2_metadata import METADATA, read_metadata
 from rigcal.sources.rosbag2_sqlite import SIGNATURE, SqliteStore
+from rigcal.sources.unknown import unknown_file
 
 if TYPE_CHECKING:
     from rigcal.sources.mcap_file import McapStore
@@ -107,12 +109,16 @@ def _file_store(path: Path) -> BagStore | SqliteStore | McapStore:
         return BagStore(path)
     if head.startswith(SIGNATURE):
         return SqliteStore(path)
+    if head and MAGIC.startswith(head):
+        raise InputError(f"{path}: is cut off after {len(head)} bytes; copy it again.")
     if head.startswith(b"#ROSBAG V"):
         version = head.split(b"\n")[0][len(b"#ROSBAG V") :].decode("ascii", "replace")
         raise InputError(f"{path}: is a bag of version {version}, only 2.0 is read; convert it with rosbag fix.")
+    if not head.startswith(MCAP_MAGIC):
+        raise unknown_file(path, head)
     from rigcal.sources.mcap_file import McapStore
 
-    return McapStore(path)  # says what is wrong if it is none either
+    return McapStore(path)
 
 
 def _files(path: Path) -> list[Path]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from loguru import logger
@@ -24,7 +25,7 @@ from rigcal.sources.message_store import MessageStore
 from rigcal.sources.options import SourceOptions
 from rigcal.sources.realsense_topics import is_realsense, realsense_cameras, with_depth_unit
 from rigcal.sources.rgbd_writer import refuse_unusable_name
-from rigcal.sources.rigcal_topics import is_rigcals, rigcal_cameras, with_layout
+from rigcal.sources.rigcal_topics import beside, rigcal_cameras, with_layout
 from rigcal.sources.ros_cameras import baseline_of, camera_of
 from rigcal.sources.ros_messages import HEAD_BYTES, read_header
 from rigcal.sources.ros_recording import CameraSource, RosRecording, Stamped
@@ -54,16 +55,25 @@ class _Opening:
         found = self._paired()
         given = self._given(found)
         cameras: list[tuple[CameraTopics, Camera, Camera | None]] = []
+        left_out: list[str] = []
+        refused: list[InputError] = []
         for topics in found:
-            camera = given.get(topics.name) or self._recorded_camera(topics)
-            if camera is not None:
-                camera = replace(camera, baseline_m=camera.baseline_m or self._baseline(topics))
-                lens = self._depth_lens(topics, camera, is_given=topics.name in given)
-                cameras.append((topics, camera, lens))
-            elif len(found) > 1:
-                logger.warning("{}: {} is left out, {}", self._store.path, topics.image, self._without(topics.name))
+            try:
+                camera = given.get(topics.name) or self._recorded_camera(topics)
+            except InputError as error:
+                refused.append(error)
+                left_out.append(f"{topics.image} is left out: {error}")
+                continue
+            if camera is None:
+                left_out.append(f"{topics.image} is left out, {self._without(topics.name)}")
+                continue
+            camera = replace(camera, baseline_m=camera.baseline_m or self._baseline(topics))
+            lens = self._depth_lens(topics, camera, is_given=topics.name in given)
+            cameras.append((topics, camera, lens))
         if not cameras:
-            raise self._no_camera(found)
+            raise refused[0] if refused else self._no_camera(found)
+        for line in left_out:
+            logger.warning("{}: {}", self._store.path, line)
         stamped = self._stamped([topics for topics, _, _ in cameras])
         return RosRecording(self._store, [_source(topics, camera, lens, stamped) for topics, camera, lens in cameras])
 
@@ -74,10 +84,9 @@ class _Opening:
             found = [with_layout(topics, with_depth_unit(self._store, camera)) for camera in found]
         elif is_realsense(topics):
             found = realsense_cameras(self._store)
-        elif is_rigcals(topics):
-            found = rigcal_cameras(topics)
         else:
-            found = paired(topics, self._samples.first, ())
+            own = rigcal_cameras(topics)
+            found = [*own, *paired(beside(topics, own), self._samples.first, ())]
         _refuse_same_names(found)
         for camera in found:
             try:
@@ -91,7 +100,7 @@ class _Opening:
         """The cameras of the recording that the user gives intrinsics of.
 
         Raises:
-            InputError: They are of images of another size.
+            InputError: They are of images of another size, or of raw ones where these are rectified.
         """
         file, known = self._options.intrinsics, self._known
         if file is None:
@@ -102,6 +111,7 @@ class _Opening:
             camera = meant(known, topics.name, only=is_only)
             if camera is not None:
                 camera = fitting(camera, file, topics.image, self._samples.size(topics.image))
+                self._check_rectified(camera, file, topics)
                 cameras[topics.name] = replace(camera, name=topics.name)
         if instead := [topics.name for topics in found if topics.name in cameras and topics.info is not None]:
             logger.info("{}: intrinsics of {} are used instead of CameraInfo", file, ", ".join(instead))
@@ -111,6 +121,18 @@ class _Opening:
             names = ", ".join(topics.name for topics in found)
             tell("{}: has intrinsics of {}, none of {}, whose CameraInfo is used", file, listed(known), names)
         return cameras
+
+    def _check_rectified(self, camera: Camera, file: Path, topics: CameraTopics) -> None:
+        """Intrinsics with distortion are hardly those of rectified images; the user who has named these may know."""
+        if not (topics.is_rectified and camera.has_distortion):
+            return
+        text = f"{file}: the intrinsics have distortion, but {topics.image} is rectified"
+        if not self._options.topics:
+            raise InputError(
+                f"{text}; name the raw images with --topics {topics.name}=IMAGE_TOPIC, or {topics.image} where the "
+                f"intrinsics are of it; its topics: {listing(self._store.topics)}."
+            )
+        logger.warning("{}; they are used for it as named", text)
 
     @cached_property
     def _known(self) -> Mapping[str, Camera]:

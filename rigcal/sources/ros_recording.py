@@ -103,7 +103,7 @@ class RosRecording:
         except DamagedError as error:
             reason = f"a message of {topic} {error}"
             logger.debug("skipped: {}", reason)
-            return BadFrame(camera.name, stamp_ns, reason)
+            return BadFrame(camera.name, stamp_ns, reason, depth_may_be_why=topic != source.image.topic)
         return Frame(
             camera=camera.name,
             stamp_ns=stamp_ns,

@@ -6,9 +6,10 @@ Leaves    topics as streams to ros_streams, reading messages to ros_opening, Rea
 
 A camera is a namespace: ``/zed/zed_node/left/image_rect_color`` is the stream ``left`` of ``/zed/zed_node``. Of its
 streams one is taken, in this order: with a camera_info before without; colour (``color``, ``rgb``), left, no stream
-named, grey, infrared, right; rectified before raw images; colour before grey; messages as they are before compressed
-ones. Left and right are two cameras where no camera_info calls them the two eyes of one; so are they and colour, and
-streams of one kind, where each has a frame and a camera_info of its own. Depth is taken in the image's frame only.
+named, grey, infrared, right, both eyes side by side; rectified before raw images; colour before grey; messages as they
+are before compressed ones. Left and right are two cameras where no camera_info calls them the two eyes of one; so are
+they and colour, and streams of one kind, where each has a frame and a camera_info of its own. Depth is taken in the
+image's frame only.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from loguru import logger
 from aruco.errors import InputError
 from rigcal.sources.message_store import Topic
 from rigcal.sources.ros_streams import First, Peek, Stream, Streams
-from rigcal.sources.topic_names import COMPRESSED, GREY, IMAGE, INFO, NO_DEPTH, TRANSPORTS, camera_name
+from rigcal.sources.topic_names import BOTH_EYES, COMPRESSED, GREY, IMAGE, INFO, NO_DEPTH, TRANSPORTS, camera_name
 
 _MAX_LISTED = 40
 # The last part of the name of the only confidence whose meaning is known besides rigcal's own.
@@ -58,7 +59,7 @@ def paired(topics: Mapping[str, Topic], peek: Peek, given: Sequence[str]) -> tup
         The cameras, sorted by name; two may have one name.
 
     Raises:
-        InputError: There is none, or a topic that is given is not there.
+        InputError: A topic that is given is not there.
     """
     streams = Streams(topics, peek)
     if given:
@@ -68,8 +69,6 @@ def paired(topics: Mapping[str, Topic], peek: Peek, given: Sequence[str]) -> tup
         for stream in streams.images:
             groups.setdefault(stream.namespace, []).append(stream)
         cameras = [camera for group in groups.values() for camera in _of_namespace(group, streams)]
-    if not cameras:
-        raise InputError(f"holds no images that are read; its topics: {listing(topics)}.")
     return tuple(sorted(cameras, key=lambda camera: camera.name))
 
 
@@ -91,8 +90,8 @@ def _of_namespace(group: Sequence[Stream], streams: Streams) -> list[CameraTopic
     for one in ranked[1:]:
         if not (has_eyes and one.side == "right") and _is_another(one, taken, streams.peek):
             taken.append(one)
-    _tell_left_out([one for one in ranked if one not in taken], taken, streams.peek)
-    return [_camera(name, one, streams) for name, one in zip(_names(taken), taken)]
+    _tell_left_out([one for one in ranked if one not in taken], taken, streams)
+    return [_camera(name, one, streams, beside=taken) for name, one in zip(_names(taken), taken)]
 
 
 def _is_another(one: Stream, taken: Sequence[Stream], peek: Peek) -> bool:
@@ -101,8 +100,8 @@ def _is_another(one: Stream, taken: Sequence[Stream], peek: Peek) -> bool:
     if one.side == "right" and "left" in sides and "right" not in sides:
         return True
     has_own_info = one.info is not None and one.info not in [other.info for other in taken]
-    # Infrared and grey images beside colour are of one device.
-    is_alike = bool(one.side) or one.kind == taken[0].kind
+    # Infrared and grey images beside colour are of one device; a camera may be called stereo.
+    is_alike = bool(one.side) or one.kind in (taken[0].kind, BOTH_EYES)
     return is_alike and has_own_info and _is_elsewhere(one, taken, peek)
 
 
@@ -122,22 +121,33 @@ def _names(taken: Sequence[Stream]) -> list[str]:
     return [camera_name((one.info or one.base).rpartition("/")[0]) or "camera" for one in taken]
 
 
-def _tell_left_out(left_out: Sequence[Stream], taken: Sequence[Stream], peek: Peek) -> None:
-    images = " and ".join(one.topic for one in taken)
-    # A device has a namespace: what has none may be cameras that are called like streams.
-    unclear = [one for one in left_out if not one.namespace and _is_elsewhere(one, taken, peek)]
+def _tell_left_out(left_out: Sequence[Stream], taken: Sequence[Stream], streams: Streams) -> None:
+    images, namespace = " and ".join(one.topic for one in taken), taken[0].namespace
+    # A device has a namespace, depth, or images as another sensor has them; else cameras may be called like streams.
+    has_depth = any(one.namespace == namespace for one in streams.depths)
+    is_device = bool(namespace) or has_depth or any("_to_" in one.name for one in left_out)
+    unclear = [one for one in left_out if not is_device and _is_elsewhere(one, taken, streams.peek)]
     if unclear:
         logger.warning(
-            "{} are taken for other images of the camera of {} and left out; where they are cameras name all with "
+            "{} {} taken to be of the camera of {} and left out; where these are several cameras name all with "
             "--topics NAME=IMAGE_TOPIC",
             ", ".join(one.base for one in unclear),
+            _be(unclear),
             images,
         )
     if known := [one.base for one in left_out if one not in unclear]:
-        logger.info("of one camera's images {} is taken, not {} (--topics chooses)", images, ", ".join(known))
+        text = "of one camera's images {} {} taken, not {} (--topics chooses)"
+        logger.info(text, images, _be(taken), ", ".join(known))
 
 
-def _camera(name: str, image: Stream, streams: Streams, *, but_depth: bool = False) -> CameraTopics:
+def _be(things: Sequence[object]) -> str:
+    return "is" if len(things) == 1 else "are"
+
+
+def _camera(
+    name: str, image: Stream, streams: Streams, *, beside: Sequence[Stream] = (), but_depth: bool = False
+) -> CameraTopics:
+    """The camera of an image; beside: the images of all cameras of its namespace."""
     camera = CameraTopics(
         name=name,
         image=image.topic,
@@ -145,7 +155,10 @@ def _camera(name: str, image: Stream, streams: Streams, *, but_depth: bool = Fal
         is_rectified=image.is_rectified,
         right_info=streams.right_info(image.namespace),
     )
-    mine = [] if but_depth else [one for one in streams.depths if one.namespace == image.namespace]
+    frame = streams.peek(image.topic).frame_id
+    others = {streams.peek(other.topic).frame_id for other in beside} - {frame, ""}
+    here = [] if but_depth else [one for one in streams.depths if one.namespace == image.namespace]
+    mine = [one for one in here if not frame or streams.peek(one.topic).frame_id not in others]
     camera = _with_depth(camera, [one for one in mine if not NO_DEPTH.search(one.name)], streams.peek)
     return _with_confidence(camera, [one for one in mine if "confidence" in one.name], streams.peek)
 

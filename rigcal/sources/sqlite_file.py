@@ -16,7 +16,8 @@ from urllib.parse import quote
 from loguru import logger
 
 # A complaint about a damaged file may hold bytes of it that are no text.
-DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
+# MemoryError: a damaged file can state a size that SQLite then asks for.
+DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

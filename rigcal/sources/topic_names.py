@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable
+from itertools import pairwise
 
 from rigcal.sources.message_store import Topic
 from rigcal.sources.ros_images import is_depth
@@ -21,13 +22,15 @@ STREAMS = (
     ("colour", r"rgb|colou?r|rgb_raw|colou?r_raw|rgb_to_depth|colou?r_to_depth"),
     ("left", r"left|left_raw|left_rect"),
     ("", None),
-    ("grey", r"mono|gr[ae]y|(left|rgb)_gr[ae]y"),
+    ("grey", r"mono|gr[ae]y|(left|rgb)(_raw)?_gr[ae]y"),
     ("infrared", r"ir|infra|infra1|infrared|infrared1|(left|ir)_(ir|left)|fisheye1?"),
-    ("right", r"right|right_(raw|rect|gr[ae]y)"),
+    ("right", r"right|right_(raw|rect|(raw_)?gr[ae]y)"),
     ("second infrared", r"infra2|infrared2|(right|ir)_(ir|right)|fisheye2"),
+    ("both eyes", r"stereo|stereo_raw"),  # side by side, or what is computed from them
 )
 # What stands behind two names of streams that are one (left/color/rect/image); elsewhere the first is a namespace.
 _VERSIONS = ("rect", "raw")
+BOTH_EYES = len(STREAMS) - 1
 DEPTH = len(STREAMS)  # index of depth and what goes with it
 _DEPTH = re.compile(
     r"depth|depth_(to_\w+|registered|raw|rect|rect_raw|image)|aligned_depth(_to_\w+)?|[sh]w_registered|"
@@ -49,18 +52,19 @@ def is_rectified(stream: str) -> bool:
     """Whether a name, from the stream on, says that its images are rectified."""
     parts = stream.strip("/").split("/")
     if parts[-1].startswith("image_raw"):
-        return False
+        return "_rect" in parts[-1]
     return any(part == "rect" or part.startswith("image_rect") or part.endswith("_rect") for part in parts)
 
 
 def named_like_streams(bases: Iterable[str]) -> frozenset[str]:
-    """Namespaces that are called like a stream, of image topics: left of /left/color/image_raw."""
+    """Namespaces that are called like a stream, of image topics: left of /left/color/image_raw, /left/zed/rgb/image."""
     found: set[str] = set()
     for base in bases:
         parts = base.strip("/").split("/")
-        for at, (part, inner, below) in enumerate(zip(parts, parts[1:], parts[2:])):
-            kind = _kind(part)
-            if kind is not None and kind != DEPTH and _kind(inner) is not None and below not in _VERSIONS:
+        streams = [at for at, part in enumerate(parts[:-1]) if _kind(part) is not None]
+        for at, inner in pairwise(streams):
+            is_version = inner == at + 1 and parts[inner + 1] in _VERSIONS
+            if _kind(parts[at]) != DEPTH and not is_version:
                 found.add("/".join(parts[: at + 1]))
     return frozenset(found)
 

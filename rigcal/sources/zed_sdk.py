@@ -210,7 +210,7 @@ class ZedRecording:
         except NotShownError as error:
             reason = f"{self._path.name}: frame {place.position} {error}"
             logger.debug("skipped: {}", reason)
-            return BadFrame(self._camera.name, place.stamp_ns, reason)
+            return BadFrame(self._camera.name, place.stamp_ns, reason, depth_may_be_why=depth)
         return Frame(
             camera=self._camera.name,
             stamp_ns=place.stamp_ns,
