@@ -364,7 +364,7 @@ TOO_DEEP = '{"1": ' + "[" * 100_000 + "]" * 100_000 + "}"
         (TOO_DEEP, "not readable as JSON"),
         ({}, "holds no camera"),
         ({"version": "5.1"}, "holds no camera"),
-        ("{" + " " * 5 * 2**20 + "}", "over 4096 KiB"),
+        ("{" + " " * 17 * 2**20 + "}", "over 16384 KiB"),
         ('{"1": {"world": {}}, "1": {"world": {}}}', "camera 1 is there twice"),
         ({"left": {"FusionConfiguration": {"pose": REAL_POSE}}}, "'left' is not a camera"),
         ({"../x": {"FusionConfiguration": {"pose": REAL_POSE}}}, "is not a camera"),

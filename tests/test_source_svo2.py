@@ -622,3 +622,16 @@ def test_the_protocol_is_kept(tmp_path: Path) -> None:
     assert stamps.dtype == np.int64
     with pytest.raises(ValueError, match="read-only"):
         stamps[0] = 0
+
+
+@pytest.mark.parametrize("codec", ["h264", "hevc"])
+def test_the_left_image_is_the_same_where_the_right_one_is_not_decoded_to_colours(tmp_path: Path, codec: str) -> None:
+    path = _recording(tmp_path, Clip(pairs=_pairs(4), codec=codec))
+    recording = opened(path, SourceOptions(stereo_depth=True))
+    for alone, both in zip(recording.frames(SERIAL, range(4)), recording.frames(SERIAL, range(4), depth=True)):
+        assert isinstance(alone, Frame)
+        assert isinstance(both, Frame)
+        assert both.depth_m is not None
+        # Colours of the last columns are filled up from their neighbours, which were cut off.
+        np.testing.assert_array_equal(alone.image[:, :-8], both.image[:, :-8])
+        assert alone.digest == both.digest

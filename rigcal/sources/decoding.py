@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -20,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aruco.errors import MissingExtraError
-from rigcal.sources.ahead import made_ahead
 from rigcal.sources.image_file import MAX_PIXELS
 from rigcal.sources.nal_units import UnitReader
 
@@ -68,7 +68,12 @@ class PacketDecoder:
     """Decodes groups of pictures of one stream, one after the other."""
 
     def __init__(
-        self, codec: str | Any, *, extradata: bytes | None = None, size: tuple[int, int] | None = None
+        self,
+        codec: str | Any,
+        *,
+        extradata: bytes | None = None,
+        size: tuple[int, int] | None = None,
+        left_px: int | None = None,
     ) -> None:
         """Make ready to decode; nothing is decoded yet.
 
@@ -77,6 +82,7 @@ class PacketDecoder:
                 an open container that nothing has been decoded with.
             extradata: Parameter sets, where they are not in the packets.
             size: (width, height) that every picture must have; None: any sane one.
+            left_px: Only so many columns from the left are wanted of the pictures, an even number; None: all.
 
         Raises:
             MissingExtraError: PyAV is not installed.
@@ -92,7 +98,8 @@ class PacketDecoder:
         self._lenient: av.VideoCodecContext | None = None
         self._units = UnitReader(self._context.name, self._extradata or b"")
         self._reformatter: Any = None
-        self._size = size
+        self._size, self._left_px = size, left_px
+        self._cutter: _Cutter | None = None
         self.n_decoded = 0  # packets given to the decoder so far
 
     def decoded(
@@ -105,10 +112,10 @@ class PacketDecoder:
             wanted: Numbers of packets (0: the first), in the order in which their pictures are shown.
 
         Yields:
-            (number, picture) for each of ``wanted``, in that order; (number, Undecoded) where there is none. A
-            picture's colours are converted while the next one is decoded.
+            (number, picture) for each of ``wanted``, in that order; (number, Undecoded) where there is none.
         """
-        return made_ahead(self._shown, self._found(packets, wanted))
+        for number, found in self._found(packets, wanted):
+            yield number, found if isinstance(found, Undecoded) else self._picture(found)
 
     def _found(self, packets: Iterable[bytes | Encoded], wanted: Sequence[int]) -> Iterator[tuple[int, Any]]:
         """(number, frame or Undecoded) for each of ``wanted``."""
@@ -170,10 +177,6 @@ class PacketDecoder:
             run.came(frame)
         return ""
 
-    def _shown(self, answer: tuple[int, Any]) -> tuple[int, Picture | Undecoded]:
-        number, found = answer
-        return number, found if isinstance(found, Undecoded) else self._picture(found)
-
     def _picture(self, frame: Any) -> Picture | Undecoded:
         if self._size is not None and (frame.width, frame.height) != self._size:
             return Undecoded(
@@ -183,9 +186,29 @@ class PacketDecoder:
         if self._reformatter is None:
             self._reformatter = self._av.video.reformatter.VideoReformatter()
         try:
+            if self._left_px is not None:
+                self._cutter = self._cutter or _Cutter(self._av, frame, self._left_px)
+                frame = self._cutter.cut(frame)
             return self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
         except (self._av.error.FFmpegError, ValueError) as error:
             return Undecoded(f"has colours that cannot be converted ({error})")
+
+
+class _Cutter:
+    """Cuts the left columns from pictures of one size and format before their colours are converted."""
+
+    def __init__(self, av: Any, first: Any, columns: int) -> None:
+        self._graph = av.filter.Graph()
+        size = {"width": first.width, "height": first.height}
+        begin = self._graph.add_buffer(**size, format=first.format, time_base=Fraction(1, 1))
+        crop = self._graph.add("crop", f"{columns}:{first.height}:0:0")
+        begin.link_to(crop)
+        crop.link_to(self._graph.add("buffersink"))
+        self._graph.configure()
+
+    def cut(self, frame: Any) -> Any:
+        self._graph.push(frame)
+        return self._graph.pull()
 
 
 class _Run:

@@ -180,7 +180,9 @@ class Svo2:
     def _frames(self, source: _Source, indices: Sequence[int], with_depth: bool) -> Iterator[Frame | BadFrame]:
         # One for each reader: a matcher works in memory of its own, which two must not share.
         matcher = _matcher(source) if with_depth else None
-        return made_ahead(lambda answer: self._frame(source, answer, matcher), source.pictures.read(indices))
+        answers = source.pictures.read(indices, both=with_depth)
+        # Rectifying takes a third of the time that decoding the next picture does.
+        return made_ahead(lambda answer: self._frame(source, answer, matcher), answers)
 
     def _frame(self, source: _Source, answer: Answer, matcher: StereoMatcher | None) -> Frame | BadFrame:
         index, pair, message = answer

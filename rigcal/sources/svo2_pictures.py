@@ -18,7 +18,7 @@ from rigcal.sources.mcap_index import DamagedError, McapIndex
 from rigcal.sources.svo2_frames import FrameIndex
 from rigcal.sources.svo2_payload import Coding, FrameError, jpeg_pair, payload_of
 
-Pair: TypeAlias = NDArray[np.uint8]  # (h, 2 w, 3) BGR, both eyes
+Pair: TypeAlias = NDArray[np.uint8]  # (h, 2 w, 3) BGR, both eyes, or (h, w, 3), the left one
 # (index of the frame, its picture or what completes "frame <n> ...", its message)
 Answer: TypeAlias = tuple[int, Pair | str, bytes]
 
@@ -32,10 +32,16 @@ class FramePictures:
     coding: Coding
     index: FrameIndex
 
-    def read(self, indices: Sequence[int]) -> Iterator[Answer]:
-        """The pictures of frames at ascending indices, in that order, one at a time."""
+    def read(self, indices: Sequence[int], *, both: bool) -> Iterator[Answer]:
+        """The pictures of frames at ascending indices, in that order, one at a time.
+
+        Args:
+            indices: Of frames.
+            both: Whether the right eye is wanted too; else it may be missing.
+        """
         # One decoder for each call: who reads a camera twice at a time must not mix the two.
-        decoder = None if self.coding == "jpeg" else PacketDecoder(self.coding, size=self._pair_size)
+        left_px = None if both else self.index.size[0]
+        decoder = None if self.coding == "jpeg" else PacketDecoder(self.coding, size=self._pair_size, left_px=left_px)
         for run in self.index.runs(indices):
             if self.index.begins[run[0]] < 0:
                 yield run[0], self.index.faults[int(self.index.messages[run[0]])], b""
